@@ -5,7 +5,7 @@ Operations are functions of a module, so that other processes can import them, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,10 +15,11 @@ import numpy as np
 from evaluation.papers.figure import Figure, find_figure, write_page
 from evaluation.papers.maps.scenarios import Recipe, Recorded
 from evaluation.papers.maps.stored_maps import STEPS, MapArrays, StoredMap, store_map
-from evaluation.papers.tables.comparison import Files, SessionLog, compare_figures
+from evaluation.papers.tables.comparison import Files, Record, SessionLog, compare_figures
 from evaluation.papers.trial_sessions import capacity_for
 from evaluation.studies.executor import run_tasks
 from ratslam.core.session import Session
+from ratslam.grid.localiser import GridLocaliser
 from ratslam.places.localiser import Localisation, Localiser
 from ratslam.runs.build_session import build_session
 from ratslam.runs.localise import localising
@@ -26,6 +27,7 @@ from ratslam.runs.merge import merge_maps
 from ratslam.runs.run_directory import changes_of
 from ratslam.runs.saved_map import read_map
 from robot.touch_source import observation_of
+from tactile.base.types import Observation
 
 
 class Localised(NamedTuple):
@@ -57,6 +59,23 @@ class Methods(NamedTuple):
     changes: Callable[[StoredMap, Recorded], np.ndarray]
 
 
+class Measured(NamedTuple):
+    """What a row measures of one session.
+
+    Attributes:
+        record: its figures by name, of which `True` is a failure. shown: what its table and its picture show
+            besides, by name.
+    """
+
+    record: Record
+    shown: Mapping[str, Any]
+
+
+def column(found: Sequence[Measured], name: str) -> np.ndarray:
+    """[n] a figure of all sessions, recorded or shown."""
+    return np.array([one.record[name] if name in one.record else one.shown[name] for one in found])
+
+
 class MapTask(NamedTuple):
     """One session of a row.
 
@@ -82,9 +101,14 @@ def localise(made: StoredMap, recorded: Recorded) -> Localised:
     """
     session = _session_in(made.path, capacity_for(recorded.log.length))
     session.restart(recorded.config.session.seed)
-    steps = list(session.replay(observation_of(sample) for sample in recorded.log))
+    return follow(session, (observation_of(sample) for sample in recorded.log))
+
+
+def follow(session: Session, observations: Iterable[Observation]) -> Localised:
+    """What a session in a map says at each of its steps."""
+    steps = list(session.replay(observations))
     localiser = session.map
-    assert isinstance(localiser, Localiser)
+    assert isinstance(localiser, Localiser | GridLocaliser)
     states = localiser.states()
     pose = np.array([step.pose for step in steps])
     return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
@@ -174,12 +198,12 @@ def reproduce_maps(
     planned = [(name, label) for name in names for label in labels[name].values()]
     log = SessionLog("maps", Files(output, against), planned)
 
-    def measure(name: str, figure: Figure) -> tuple[list[str], list[Any]]:
+    def measure(name: str, figure: Figure) -> tuple[list[str], list[Measured]]:
         used = list(labels[name].values())
         tasks = [MapTask(seed, output / "maps", methods) for seed in labels[name]]
         found = []
         for label, figures in zip(used, run_tasks(figure.measure, tasks, workers=workers), strict=True):
-            log.add(name, label, figures.record())
+            log.add(name, label, figures.record)
             found.append(figures)
         named = ", ".join(used if len(used) < 3 else (used[0], "...", used[-1]))
         return [f"{len(tasks)} sessions: {named}.", ""], found

@@ -114,11 +114,11 @@ _Parts = tuple[tuple[Cell, ...], tuple[Cell, ...]]
 """Two lists of cells of a maze, each connected, in order of growth."""
 
 
-def _maze_graph(maze: Maze, start: Cell) -> networkx.Graph:
-    """The cells that can be reached from `start`, with an edge between neighbours without a wall."""
+def _maze_graph(maze: Maze, loop: Sequence[Cell]) -> networkx.Graph:
+    """The cells that can be reached from a loop, with an edge between neighbours without a wall."""
     graph: networkx.Graph = networkx.Graph()
-    edge = [start]
-    graph.add_node(start)
+    edge = [loop[0]]
+    graph.add_node(loop[0])
     while edge:
         here = edge.pop()
         for cell in maze.neighbours(here):
@@ -208,56 +208,9 @@ def cells_of(poses: np.ndarray) -> list[Cell]:
     return [(int(x), int(y)) for x, y in np.floor(poses[:, :2] / CELL_SIDE)]
 
 
-class _World(NamedTuple):
-    """A maze and its loop in anticlockwise order."""
-
-    maze: Maze
-    loop: list[Cell]
-
-
-class _Overlap(NamedTuple):
-    """Two sessions in parts of a maze that share half their cells, and one session over both.
-
-    Attributes:
-        parts: their cells.
-    """
-
-    one: Recipe
-    other: Recipe
-    both: Recipe
-    parts: _Parts
-
-
-class _Carried(NamedTuple):
-    """A session in one part of a maze, and two sessions of a robot that was carried away after it.
-
-    Attributes:
-        first: explores the known part. known: enters the known part, after up to `LEAD` cells of the other,
-            and stays there for `REENTERED` whisks. entry: its first step there. unknown: stays in the other
-            part. parts: the known cells, and the others.
-    """
-
-    first: Recipe
-    known: Recipe
-    entry: int
-    unknown: Recipe
-    parts: _Parts
-
-
-class Change(NamedTuple):
-    """A session after a maze has changed.
-
-    Attributes:
-        after: the session. places: [n, 2] middles of the walls that are gone or new, m.
-    """
-
-    after: Recipe
-    places: np.ndarray
-
-
-def open_world(maze: int) -> _World:
-    """The unchanged maze of a seed."""
-    return _World(*make_maze(MazeConfig(seed=maze), PathConfig(), maze))
+def open_world(maze: int) -> tuple[Maze, list[Cell]]:
+    """The unchanged maze of a seed, and its loop in anticlockwise order."""
+    return make_maze(MazeConfig(seed=maze), PathConfig(), maze)
 
 
 def ten_circuits(maze: int) -> Recipe:
@@ -272,16 +225,11 @@ def unknown_start(maze: int, whisks: int = LOCALISED, name: str = "start") -> Re
         name: of its random streams; a further name gives a further session.
     """
     random = stream(maze, f"atlas.{name}.route")
-    number = int(random.integers(1, len(open_world(maze).loop)))
+    number = int(random.integers(1, len(open_world(maze)[1])))
     letter = "CA"[int(random.integers(2))]
     first = int(random.integers(8))  # a cell takes about 6 whisks, and a turn up to 4
     path = {"circuits": 3 * letter, "start": number}
     return Recipe(_later(maze, name, {"path": path}), first, first + whisks)
-
-
-def other_maze(maze: int) -> Recipe:
-    """A session in the maze of the next seed."""
-    return unknown_start(maze + 1, FOREIGN, "foreign")
 
 
 def same_maze(maze: int, number: int) -> Recipe:
@@ -289,54 +237,57 @@ def same_maze(maze: int, number: int) -> Recipe:
     if number == 0:
         return ten_circuits(maze)
     name = f"again {number}"
-    start = int(stream(maze, f"atlas.{name}.route").integers(len(open_world(maze).loop)))
+    start = int(stream(maze, f"atlas.{name}.route").integers(len(open_world(maze)[1])))
     return Recipe(_later(maze, name, {"path": {"circuits": PAPER_CIRCUITS, "start": start}}))
 
 
-def overlapping_sessions(maze: int) -> _Overlap:
+def overlapping_sessions(maze: int) -> tuple[Recipe, Recipe, Recipe]:
     """Explorations of two parts that share half their cells, and one as long as both together over both."""
-    random = stream(maze, "atlas.overlap.parts")
-    world = open_world(maze)
-    parts = _overlapping_parts(_maze_graph(world.maze, world.loop[0]), random)
-    union = tuple(dict.fromkeys(parts[0] + parts[1]))
-    lengths = {"one": (parts[0], PART), "other": (parts[1], PART), "both": (union, 2 * PART)}
-    sessions = {
-        name: _explore_all(maze, world, f"overlap {name}", cells, steps)
-        for name, (cells, steps) in lengths.items()
-    }
-    return _Overlap(**sessions, parts=parts)
+    world, loop = open_world(maze)
+    one, other = _overlapping_parts(_maze_graph(world, loop), stream(maze, "atlas.overlap.parts"))
+    return (
+        _explore_all(maze, world, "overlap one", one, PART),
+        _explore_all(maze, world, "overlap other", other, PART),
+        _explore_all(maze, world, "overlap both", tuple(dict.fromkeys(one + other)), 2 * PART),
+    )
 
 
-def carried_sessions(maze: int) -> _Carried:
-    """An exploration of one half of a maze; then the robot is carried to a known and to an unknown place."""
+def carried_sessions(maze: int) -> tuple[Recipe, Recipe, Recipe, int]:
+    """An exploration of one half of a maze; then the robot is carried to a known and to an unknown place.
+
+    Returns:
+        first: explores the known part. known: enters it, after up to `LEAD` cells of the other one, and stays
+        there for `REENTERED` whisks. unknown: stays in the other part. The first step of `known` in the known
+        part.
+    """
     random = stream(maze, "atlas.carried.parts")
-    world = open_world(maze)
-    parts = _separate_parts(_maze_graph(world.maze, world.loop[0]), random)
+    world, loop = open_world(maze)
+    parts = _separate_parts(_maze_graph(world, loop), random)
     if random.integers(2):
         parts = parts[::-1]
-    way = _enter(world.maze, parts, random)
+    way = _enter(world, parts, random)
     config = _later(maze, "carried known", {"path": {"cells": way}})
     truth = record(Recipe(config)).truth
     entry = next((step for step, cell in enumerate(cells_of(truth)) if cell in parts[0]), len(truth))
     path = {"explore": float(LOCALISED), "within": _turned(parts[1], random)}
-    return _Carried(
-        first=_explore_all(maze, world, "carried first", parts[0], PART),
-        known=Recipe(config, 0, entry + REENTERED),
-        entry=entry,
-        unknown=Recipe(_later(maze, "carried unknown", {"path": path})),
-        parts=parts,
+    return (
+        _explore_all(maze, world, "carried first", parts[0], PART),
+        Recipe(config, 0, entry + REENTERED),
+        Recipe(_later(maze, "carried unknown", {"path": path})),
+        entry,
     )
 
 
-def moved_wall(maze: int) -> Change:
-    """Circuits after a wall beside the loop has been taken away and put up at another place beside it.
+def moved_wall(maze: int) -> tuple[Recipe, np.ndarray]:
+    """Circuits after a wall beside the loop has been taken away and put up at another place beside it; the
+    middles [2, 2] of both places, m.
 
     Raises:
         InputError: no wall beside the loop has a gap beside the loop near it.
     """
     random = stream(maze, "atlas.wall")
-    world = open_world(maze)
-    walls, gaps = (_walls_beside(world.maze, world.loop, there) for there in (True, False))
+    world, loop = open_world(maze)
+    walls, gaps = (_walls_beside(world, loop, there) for there in (True, False))
     moves = [
         (wall, gap)
         for wall in walls
@@ -346,24 +297,23 @@ def moved_wall(maze: int) -> Change:
     if not moves:
         raise InputError("simulation.maze", f"maze {maze} has no gap near a wall", "one beside the loop")
     wall, gap = moves[int(random.integers(len(moves)))]
-    start = int(random.integers(len(world.loop)))
+    start = int(random.integers(len(loop)))
     settings = {"maze": {"added": [gap], "removed": [wall]}, "path": {"circuits": AFTER, "start": start}}
-    return Change(
-        Recipe(_later(maze, "wall moved", settings)), np.array([wall_middle(*wall), wall_middle(*gap)])
-    )
+    places = np.array([wall_middle(*wall), wall_middle(*gap)])
+    return Recipe(_later(maze, "wall moved", settings)), places
 
 
-def closed_door(maze: int) -> Change:
+def closed_door(maze: int) -> tuple[Recipe, np.ndarray]:
     """A session after the loop has been closed between two cells: up to the door, back, all the way round to
-    its other side, and so on, from a random cell."""
+    its other side, and so on, from a random cell; the middle [1, 2] of the door, m."""
     random = stream(maze, "atlas.door")
-    loop = open_world(maze).loop
+    _, loop = open_world(maze)
     shut = int(random.integers(len(loop)))
     line = [*loop[shut:], *loop[:shut]]  # from one side of the door to the other
     start = int(random.integers(1, len(line) - 1))
     way = [*line[start:], *line[-2::-1], *line[1:], *line[-2:0:-1]]
     settings = {"maze": {"added": [(line[0], line[-1])]}, "path": {"cells": way}}
-    return Change(Recipe(_later(maze, "door", settings)), wall_middle(line[0], line[-1])[None])
+    return Recipe(_later(maze, "door", settings)), wall_middle(line[0], line[-1])[None]
 
 
 def kidnapped(maze: int) -> Recipe:
@@ -376,18 +326,18 @@ def _later(maze: int, name: str, settings: dict[str, Any]) -> RunConfig:
     return touch_config(maze, draw_seed(maze, name), MAIN | settings, {})
 
 
-def _explore_all(maze: int, world: _World, name: str, cells: tuple[Cell, ...], steps: int) -> Recipe:
+def _explore_all(seed: int, maze: Maze, name: str, cells: tuple[Cell, ...], steps: int) -> Recipe:
     """A session that enters each of these cells and no other, from a random one on.
 
     Raises:
         InputError: none of `TRIES` random routes enters all.
     """
-    random = stream(maze, f"atlas.{name}.route")
+    random = stream(seed, f"atlas.{name}.route")
     for _ in range(TRIES):
         start = cells[int(random.integers(len(cells)))]
-        way = exploration_route(world.maze, start, steps, random, cells)
+        way = exploration_route(maze, start, steps, random, cells)
         if set(way) == set(cells):
-            return Recipe(_later(maze, name, {"path": {"cells": way}}))
+            return Recipe(_later(seed, name, {"path": {"cells": way}}))
     raise InputError("simulation.path.cells", f"no route of {steps} cells", f"one through {len(cells)} cells")
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.run_metrics import energy_within_pieces
 from evaluation.metrics.trajectory import ate
-from evaluation.papers.maps.localisation_metrics import MapSteps, known_steps
+from evaluation.papers.maps.localisation_metrics import MapSteps
 from evaluation.papers.maps.scenarios import Recipe, Recorded, record
 from evaluation.papers.trial_sessions import start_session
 from evaluation.studies.machine import code_digest
@@ -44,7 +44,7 @@ class MapArrays(NamedTuple):
     @property
     def steps(self) -> MapSteps:
         """The steps with a true pose."""
-        return known_steps(self.trajectory, self.truth)
+        return MapSteps.known(self.trajectory, self.truth)
 
     @property
     def em(self) -> float:

@@ -5,19 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.papers.maps.localisation_metrics import (
-    BUILDING,
-    RIGHT,
-    WRONG,
-    aligned_errors,
-    exceeds,
-    is_revisited,
-    is_within,
-    known_steps,
-    localisation_errors,
-    nearest_steps,
-    true_places,
-)
+from evaluation.papers.maps.localisation_metrics import BUILDING, RIGHT, WRONG, MapSteps, pose_errors
 from tactile.base.se2 import compose
 
 
@@ -28,49 +16,47 @@ def straight(count: int = 11) -> np.ndarray:
 
 def test_a_map_that_is_moved_has_no_error() -> None:
     truth, motion = straight(), np.array([3.0, -2.0, 2.0])
-    steps = known_steps(compose(motion, truth), truth)
+    steps = MapSteps.known(compose(motion, truth), truth)
     here = np.array([[0.43, 0.05, 0.3], [0.9, 0.0, -0.2]])
-    np.testing.assert_allclose(localisation_errors(steps, compose(motion, here), here, 0.1), 0, atol=1e-12)
-    np.testing.assert_allclose(aligned_errors(steps, compose(motion, here), here), 0, atol=1e-12)
+    np.testing.assert_allclose(steps.errors(compose(motion, here), here, 0.1), 0, atol=1e-12)
+    np.testing.assert_allclose(pose_errors(steps.align(compose(motion, here)), here), 0, atol=1e-12)
 
 
 def test_a_bent_map_is_an_error_only_after_alignment() -> None:
     truth = straight()
     bent = truth.copy()
     bent[6:] = compose(np.array([0.3, 0.4, 0.5]), truth[6:])
-    steps = known_steps(bent, truth)
+    steps = MapSteps.known(bent, truth)
     here = truth[[8]] + [0.0, 0.02, 0.0]
     pose = compose(np.array([0.3, 0.4, 0.5]), here)
-    np.testing.assert_allclose(localisation_errors(steps, pose, here, 0.1), 0, atol=1e-12)
-    assert aligned_errors(steps, pose, here)[0, 0] > 0.05
+    np.testing.assert_allclose(steps.errors(pose, here, 0.1), 0, atol=1e-12)
+    assert pose_errors(steps.align(pose), here)[0, 0] > 0.05
 
 
 def test_a_wrong_place_is_an_error_of_its_distance_and_turn() -> None:
     truth = straight()
-    steps = known_steps(truth, truth)
-    error = localisation_errors(
-        steps, np.array([[0.5, 0.1, np.pi - 0.1]]), np.array([[0.2, 0.1, -np.pi]]), 0.1
-    )
+    steps = MapSteps.known(truth, truth)
+    error = steps.errors(np.array([[0.5, 0.1, np.pi - 0.1]]), np.array([[0.2, 0.1, -np.pi]]), 0.1)
     np.testing.assert_allclose(error, [[0.3, 0.1]], atol=1e-12)
 
 
 def test_a_step_with_the_same_heading_is_preferred_if_it_is_about_as_near() -> None:
     truth = np.array([[0.0, 0.0, np.pi], [0.05, 0.0, 0.0], [0.5, 0.0, 0.0]])
-    steps = known_steps(truth, truth)
-    assert nearest_steps(steps, np.zeros((1, 3)), 0.09).tolist() == [1]
-    assert nearest_steps(steps, np.zeros((1, 3)), 0.04).tolist() == [0]
+    steps = MapSteps.known(truth, truth)
+    assert steps.nearest(np.zeros((1, 3)), 0.09).tolist() == [1]
+    assert steps.nearest(np.zeros((1, 3)), 0.04).tolist() == [0]
 
 
 def test_steps_without_truth_are_left_out() -> None:
     truth = straight()
     truth[3] = np.nan
-    steps = known_steps(straight(), truth)
+    steps = MapSteps.known(straight(), truth)
     assert len(steps.pose) == 10
-    error = localisation_errors(steps, straight(), truth, 0.1)
+    error = steps.errors(straight(), truth, 0.1)
     assert np.isnan(error[3]).all()
-    assert not exceeds(error, WRONG)[3]
-    assert not is_within(error, RIGHT)[3]
-    assert is_within(error, RIGHT).sum() == 10
+    assert not WRONG.exceeded(error)[3]
+    assert not RIGHT.holds(error)[3]
+    assert RIGHT.holds(error).sum() == 10
 
 
 @pytest.mark.parametrize(
@@ -83,17 +69,17 @@ def test_steps_without_truth_are_left_out() -> None:
     ],
 )
 def test_between_right_and_wrong_is_neither(error: tuple[float, float], right: bool, wrong: bool) -> None:
-    assert is_within(np.array([error]), RIGHT)[0] == right
-    assert exceeds(np.array([error]), WRONG)[0] == wrong
+    assert RIGHT.holds(np.array([error]))[0] == right
+    assert WRONG.exceeded(np.array([error]))[0] == wrong
 
 
 def test_a_step_is_revisited_with_its_heading() -> None:
-    steps = known_steps(straight(), straight())
+    steps = MapSteps.known(straight(), straight())
     truth = np.array([[0.5, 1.9, 0.5], [0.5, 2.1, 0.0], [0.5, 0.0, np.pi]])
-    assert is_revisited(steps, truth, BUILDING).tolist() == [True, False, False]
+    assert steps.revisited(truth, BUILDING).tolist() == [True, False, False]
 
 
 def test_places_move_with_the_map_around_them() -> None:
     truth, motion = straight(), np.array([1.0, 2.0, np.pi / 2])
     place = compose(motion, np.array([[0.5, 0.2, 0.0]]))[:, :2]
-    np.testing.assert_allclose(true_places(known_steps(compose(motion, truth), truth), place), [[0.5, 0.2]])
+    np.testing.assert_allclose(MapSteps.known(compose(motion, truth), truth).true_places(place), [[0.5, 0.2]])

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.papers.maps.localisation_metrics import nearest_steps
 from evaluation.papers.maps.operations import Localised, Methods
 from evaluation.papers.maps.scenarios import Recorded
 from evaluation.papers.maps.stored_maps import MapArrays, StoredMap
@@ -21,7 +20,7 @@ FOUND_AFTER = 10
 def true_pose(made: StoredMap, truth: np.ndarray) -> np.ndarray:
     """[T, 3] where true poses are in a map: moved with the nearest step."""
     steps = made.arrays.steps
-    near = nearest_steps(steps, truth, 0.09)
+    near = steps.nearest(truth, 0.09)
     return compose(steps.pose[near], between(steps.truth[near], truth))
 
 

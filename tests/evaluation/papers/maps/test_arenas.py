@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.papers.maps.arenas import (
-    GRID,
-    REPORTS,
-    SOON,
-    ArenaDrive,
-    ArenaFigures,
-    shuffled_contacts,
-)
+from evaluation.papers.maps.arenas import GRID, REPORTS, SOON, arena_figures, shuffled_contacts
 from evaluation.papers.maps.localising import Judged
+from evaluation.papers.maps.operations import Localised, Measured
 from tests.evaluation.papers.maps.stand_ins import cells_by_figure
 from tests.helpers.grid_world import report
 
@@ -23,19 +17,14 @@ def judged(found_at: int, error: float) -> Judged:
     return Judged(found, ~found, found & (error <= 0.09), found & (error > 0.18), errors, errors)
 
 
-def figures(found_at: int, error: float, other_at: int) -> ArenaFigures:
-    return ArenaFigures(
-        arena=1,
-        session=judged(found_at, error),
-        shuffled=judged(REPORTS, 1.0),
-        other=np.arange(REPORTS) >= other_at,
-        foreign=other_at >= REPORTS,
-        best=(error <= 0.09, error <= 0.09),
-        reckoned=np.full(REPORTS, 0.2),
-    )
+def figures(found_at: int, error: float, other_at: int) -> Measured:
+    other = np.arange(REPORTS) >= other_at
+    elsewhere = Localised(other, np.full(REPORTS, other_at >= REPORTS), np.zeros((REPORTS, 3)))
+    session, shuffled = judged(found_at, error), judged(REPORTS, 1.0)
+    return arena_figures(session, shuffled, elsewhere, np.full(REPORTS, 0.2))
 
 
-def measured(*found: ArenaFigures) -> dict[str, str]:
+def measured(*found: Measured) -> dict[str, str]:
     return {figure: values[0].split(" [")[0] for figure, values in cells_by_figure(GRID.table(found)).items()}
 
 
@@ -50,8 +39,8 @@ def test_right_and_wrong_sessions_are_counted() -> None:
 
 
 def test_a_session_is_recorded_with_what_it_fails_in() -> None:
-    def failed(one: ArenaFigures) -> list[str]:
-        return [name for name, value in one.record().items() if value is True]
+    def failed(one: Measured) -> list[str]:
+        return [name for name, value in one.record.items() if value is True]
 
     assert failed(figures(SOON - 1, 0.02, REPORTS)) == []
     assert failed(figures(SOON, 0.03, SOON)) == ["missed_soon", "found_elsewhere", "not_said"]
@@ -61,9 +50,8 @@ def test_a_session_is_recorded_with_what_it_fails_in() -> None:
 
 def test_shuffled_contacts_keep_odometry_and_what_was_met() -> None:
     seen = [report(0.01 * k, touching=[k % 4] if k % 3 == 0 else []) for k in range(20)]
-    drive = ArenaDrive(seen, np.zeros((20, 3)), np.zeros((20, 3)))
-    mixed = shuffled_contacts(drive, 0)
-    assert [one.odometry for one in mixed.observations] == [one.odometry for one in seen]
-    contacts, before = ([one.contact.tolist() for one in each] for each in (mixed.observations, seen))
+    mixed = shuffled_contacts(seen, 0)
+    assert [one.odometry for one in mixed] == [one.odometry for one in seen]
+    contacts, before = ([one.contact.tolist() for one in each] for each in (mixed, seen))
     assert sorted(contacts) == sorted(before)
     assert contacts != before

@@ -7,22 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.maps.goals import (
-    GOALS,
-    ClosedLoop,
-    Drive,
-    GoalFigures,
-    cells_between,
-    clearance,
-    driven_map,
-    shortest_driven,
-    walls_of,
-)
-from evaluation.papers.maps.scenarios import Recipe, touch_config
+from evaluation.papers.maps.goals import GOALS, ClosedLoop, Drive, clearance, goal_figures, shortest_driven
+from evaluation.papers.maps.scenarios import Recipe, open_world, touch_config
 from evaluation.papers.maps.stored_maps import store_map
 from evaluation.papers.tables.touch_table import MAIN
 from robot.live.goal_drive import DriveState
-from robot.world.maze import cell_centre
+from robot.world.maze import cell_centre, wall_boxes
+from tactile.base.random_streams import stream
 from tests.evaluation.papers.maps.stand_ins import cells_by_figure
 
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -36,8 +27,8 @@ def drive(state: DriveState, error: float, replans: int = 0) -> Drive:
 
 def test_the_shortest_way_runs_along_the_lines_between_cells():
     a, b = cell_centre((0, 0)) + [0.02, 0.0], cell_centre((1, 1))
-    assert shortest_driven(SQUARE, a, b) == pytest.approx(0.16 + 0.18)
-    assert cells_between(SQUARE, a, b - [0.0, 0.02]) == [(1, 0)]
+    assert shortest_driven(SQUARE, a, b)[0] == pytest.approx(0.16 + 0.18)
+    assert shortest_driven(SQUARE, a, b - [0.0, 0.02])[1] == [(1, 0)]
 
 
 def test_only_true_ends_count_as_reached(tmp_path: Path):
@@ -47,14 +38,16 @@ def test_only_true_ends_count_as_reached(tmp_path: Path):
         drive(DriveState.REACHED, 0.01, 1),
         drive(DriveState.REACHED, 0.01),
     ]
-    found = GoalFigures(MAZE, [drive(*end) for end in ends], walled, 120.0, np.zeros((2, 2)), 0.09)
+    maze, _ = open_world(MAZE)
+    walls = wall_boxes(maze, stream(0, "maze.heights"))
+    found = goal_figures([drive(*end) for end in ends], walled, 120.0, np.zeros((2, 2)), maze, walls)
     lines = cells_by_figure(GOALS.table([found]))
     assert lines["reached (truly within 0.09 m)"][0].startswith("1 of 3")
     assert lines["reached (truly within 0.09 m)"][1].startswith("0 of 3")
     assert lines["said to be reached at a wrong place"][0].startswith("1 of 6")
     assert lines["path over the shortest driven way, all reached"][0] == "1.11"
     assert lines["wall in the way: reached by a new way, or blocked"][0].startswith("2 of 3")
-    record = found.record()
+    record = found.record
     counts = [record[name] for name in ("not_reached", "wrongly_reached", "in_wall", "wall_not_solved")]
     assert counts == [2, 1, 0, 1]
     assert record["path_ratio"] == pytest.approx(0.2 / 0.18)
@@ -67,16 +60,14 @@ def test_only_true_ends_count_as_reached(tmp_path: Path):
 def test_the_arm_drives_to_a_goal_on_its_map(tmp_path: Path):
     settings = MAIN | {"path": {"circuits": "CCC"}}
     recipe = Recipe(touch_config(MAZE, 1, settings, {}))
-    made = driven_map(recipe, store_map(recipe, tmp_path))
-    loop = ClosedLoop(made)
-    places = {place: loop.place_of(place) for place in loop.experiences}
-    far = {place: shortest_driven(made.scene.loop, loop.pose[:2], at) for place, at in places.items()}
+    loop = ClosedLoop(recipe, store_map(recipe, tmp_path))
+    far = {place: loop.way_to(place)[0] for place in loop.experiences}
     goal = min(far, key=lambda place: abs(far[place] - 0.4))
     end = loop.drive(goal)
     assert end.reached, (end.state, end.reason, end.error)
     assert end.clear
     assert end.length <= 1.15 * end.shortest + 0.09
-    walls = walls_of(made).walls
+    walls = loop.walls().walls
     assert clearance(walls, end.path) == end.clearance
-    assert (walls.box == made.scene.surroundings.walls.box).all()
-    assert (walls.height == made.scene.surroundings.walls.height).all()
+    assert (walls.box == loop.scene.surroundings.walls.box).all()
+    assert (walls.height == loop.scene.surroundings.walls.height).all()
