@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -36,9 +36,9 @@ from evaluation.cells.rate_map import (
     tuning_curves,
 )
 from evaluation.cells.recording import BinnedSums
-from evaluation.papers.cells.rat_sessions import SECONDS, record_rat, with_active_cells
+from evaluation.papers.cells.panels import table_lines
+from evaluation.papers.cells.rat_sessions import SECONDS, record_rat
 from evaluation.papers.figure import Figure, Task
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from tactile.base.errors import InputError
 
 CELLS, GOAL = 100, 1e-6
@@ -46,23 +46,13 @@ CELLS, GOAL = 100, 1e-6
 COLUMNS = ("score", "package", "cells", "largest difference", "goal", "largest score")
 
 
-class _Agreement(NamedTuple):
-    """One score. mine, theirs: [n] of the same cells, NaN where undefined."""
-
-    score: str
-    package: str
-    mine: np.ndarray
-    theirs: np.ndarray
-
-    def difference(self) -> float:
-        """The largest difference; infinite where only one is undefined."""
-        both = np.isnan(self.mine) & np.isnan(self.theirs)
-        apart = np.abs(self.mine - self.theirs)[~both]
-        return float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))
+_Pair = tuple[str, str, np.ndarray, np.ndarray]
+"""A score, the package, and the values of ours and of theirs for the same cells [n], NaN where undefined."""
 
 
-def compare_scores(task: Task, seconds: float = SECONDS) -> list[_Agreement]:
-    """Scores of recorded pose cells of a rat, beside those of two other packages on the same maps.
+def compare_scores(task: Task, seconds: float = SECONDS) -> list[tuple[str, str, int, float, float]]:
+    """Scores of recorded pose cells of a rat, beside those of two other packages on the same maps: score,
+    package, number of cells, largest difference (infinite where only one is undefined) and largest score.
 
     Args:
         task: its sessions are the number of cells. seconds: of the session.
@@ -72,28 +62,35 @@ def compare_scores(task: Task, seconds: float = SECONDS) -> list[_Agreement]:
     """
     opexebo, pynapple = _load_package("opexebo"), _load_package("pynapple")
     count = task.sessions or CELLS
-    recording = with_active_cells(record_rat("rat", 2 * count, seconds=seconds, seed=task.first), count)
+    recording = record_rat("rat", count, seconds=seconds, seed=task.first)
     rates = recording.activity * float(np.prod(recording.shape))
     edges = arena_edges(recording.truth, 20)
     sums = bin_activity(recording.time, recording.truth, rates, *edges, 36)
     with quiet():
-        return [*_beside_opexebo(opexebo, sums), *_beside_pynapple(pynapple, sums)]
+        pairs = [*_beside_opexebo(opexebo, sums), *_beside_pynapple(pynapple, sums)]
+    found = []
+    for score, package, mine, theirs in pairs:
+        apart = np.abs(mine - theirs)[~(np.isnan(mine) & np.isnan(theirs))]
+        difference = float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))
+        largest = float(np.nanmax(np.abs(mine))) if np.isfinite(mine).any() else np.nan
+        found.append((score, package, len(mine), difference, largest))
+    return found
 
 
-def _agreement_table(result: list[_Agreement]) -> Iterator[str]:
+def _agreement_table(result: list[tuple[str, str, int, float, float]]) -> list[str]:
     """The lines of the table."""
-    yield (
+    note = (
         "Recorded pose cells of a rat in 20 x 20 place and 36 heading bins, maps smoothed over 1.5 bins; "
-        "each package gets the same maps, in its own convention (`evaluation/cells/README.md`).\n"
+        "each package gets the same maps, in its own convention (`evaluation/cells/README.md`)."
     )
-    yield markdown_header(COLUMNS)
-    for one in result:
-        found = f"{one.difference():.1e}"
-        largest = f"{np.nanmax(np.abs(one.mine)):.3g}" if np.isfinite(one.mine).any() else "-"
-        yield markdown_row([one.score, one.package, len(one.mine), found, f"{GOAL:.0e}", largest])
+    rows = (
+        [*names, f"{difference:.1e}", f"{GOAL:.0e}", "-" if np.isnan(largest) else f"{largest:.3g}"]
+        for *names, difference, largest in result
+    )
+    return table_lines([note], COLUMNS, rows)
 
 
-def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[_Agreement]:
+def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[_Pair]:
     analysis, maps, curves = opexebo.analysis, rate_maps(sums, 1.5), tuning_curves(sums)
     masked = [np.ma.masked_invalid(each) for each in maps]
     seconds = np.ma.masked_where(np.isnan(maps[0]), sums.seconds)
@@ -105,32 +102,32 @@ def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[_Agreemen
         "peak of the map": (peak_rate, "peak_rate"),
     }
     for name, (score, key) in named.items():
-        yield _Agreement(name, "opexebo", score(maps, sums.seconds), _numbers(each[key] for each in stats))
+        yield name, "opexebo", score(maps, sums.seconds), _numbers(each[key] for each in stats)
     plain = np.nan_to_num(rate_maps(sums, 0.0))
     framed = neighbour_means(np.pad(plain, ((0, 0), (1, 1), (1, 1))))[:, 1:-1, 1:-1]
     theirs = _numbers(analysis.rate_map_coherence(np.ma.masked_invalid(each)) for each in plain)
-    yield _Agreement("coherence, not transformed", "opexebo", correlate(plain, framed), theirs)
+    yield "coherence, not transformed", "opexebo", correlate(plain, framed), theirs
     tuned = [analysis.tuning_curve_stats(np.ma.masked_invalid(each)) for each in curves]
     vector = mean_vector_length(curves, sums.heading_seconds)
-    yield _Agreement("mean vector length", "opexebo", vector, _numbers(each["hd_mvl"] for each in tuned))
+    yield "mean vector length", "opexebo", vector, _numbers(each["hd_mvl"] for each in tuned)
     fields = find_fields(maps)
     own = np.unique(fields.cell)
     theirs = _numbers(border_score(opexebo, maps, fields, cell) for cell in own)
-    yield _Agreement("border score, same fields", "opexebo", score_borders(maps, fields)[own], theirs)
+    yield "border score, same fields", "opexebo", score_borders(maps, fields)[own], theirs
     images = autocorrelogram(np.nan_to_num(maps))
     theirs = _numbers(grid_score(opexebo, image) for image in images)
-    yield _Agreement("grid score", "opexebo", lattice_scores(images), theirs)
+    yield "grid score", "opexebo", lattice_scores(images), theirs
 
 
-def _beside_pynapple(pynapple: ModuleType, sums: BinnedSums) -> Iterator[_Agreement]:
+def _beside_pynapple(pynapple: ModuleType, sums: BinnedSums) -> Iterator[_Pair]:
     for what, rates, seconds in (
         ("place", rate_maps(sums, 1.5), sums.seconds),
         ("heading", tuning_curves(sums), sums.heading_seconds),
     ):
         theirs = mutual_information(pynapple, rates, seconds)
         mine = information(rates, seconds), information_rate(rates, seconds)
-        yield _Agreement(f"information, {what}", "pynapple", mine[0], theirs["bits/spike"])
-        yield _Agreement(f"information rate, {what}", "pynapple", mine[1], theirs["bits/sec"])
+        yield f"information, {what}", "pynapple", mine[0], theirs["bits/spike"]
+        yield f"information rate, {what}", "pynapple", mine[1], theirs["bits/sec"]
 
 
 def _numbers(values: Iterator[Any]) -> np.ndarray:

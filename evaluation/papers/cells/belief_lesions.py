@@ -10,18 +10,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest.mock import patch
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evaluation.papers.cells.panels import head_panel, panel_grid, time_call
+from evaluation.papers.cells.panels import name_panel, panel_grid, table_lines, time_call
 from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.buildings import FALSE_DISTANCE
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import Recording
 from evaluation.papers.tables.touch_table import SessionFigures, TouchTask, run_and_measure, task_config
 from evaluation.papers.trial_sessions import closure_claims, collect_session, new_session, run_recording
@@ -120,7 +120,7 @@ def _permuted_ties(seed: int) -> Functions:
     }
 
 
-def silent_cells(share: float, seed: int) -> Functions:
+def _silent_cells(share: float, seed: int) -> Functions:
     """A random share of the cells never becomes active."""
     anchor = pose_cells.anchor
 
@@ -159,7 +159,7 @@ LESIONS: dict[str, Callable[[int], Functions]] = {
     "ties permuted alone": _permuted_ties,
     # Odometry moves no cell.
     "no path integration": lambda seed: {"integrate_path": lambda cells, motion: cells},
-    **{f"{share:.0%} silent": partial(silent_cells, share) for share in SILENT},
+    **{f"{share:.0%} silent": partial(_silent_cells, share) for share in SILENT},
 }
 """The lesions by name; `EXCHANGED` needs a session of its own. Each makes functions from a seed."""
 GOALS = {
@@ -172,59 +172,44 @@ GOALS = {
 }
 
 
-class _LesionTask(NamedTuple):
-    """A session with a lesion. row: of the touch table; "": Intel's recording."""
-
-    lesion: str
-    row: str
-    maze: int
-
-
-class _LesionFigures(NamedTuple):
-    """Figures of a session. figures: None for Intel. closures: [K, 2] steps. true: closures that are true."""
-
-    figures: SessionFigures | None
-    closures: np.ndarray
-    true: int
+_Lesioned = tuple[SessionFigures | None, float, int]
+"""Figures of a session, None for Intel; share of the closures of the intact network that are in it too, pair
+for pair, NaN if there are none; number of its closures that are true."""
+_Lesions = Mapping[tuple[str, str], list[_Lesioned]]
+"""The mazes by lesion and row of the touch table; row "": Intel's recording."""
 
 
 def measure_lesions(
     task: Task, lesions: Sequence[str] = (*LESIONS, EXCHANGED), rows: Sequence[str] = ROWS
-) -> Mapping[_LesionTask, _LesionFigures]:
-    """The figures of the sessions of all lesions; those on Intel where it is at hand."""
-    tasks = [
-        _LesionTask(lesion, row, maze) for row in rows for maze in task.seeds(USUAL) for lesion in lesions
-    ]
+) -> _Lesions:
+    """The figures of the sessions of all lesions, `INTACT` among them; those on Intel where it is at hand."""
+    tasks = [(lesion, row, maze) for row in rows for maze in task.seeds(USUAL) for lesion in lesions]
     if not INTEL.missing(Path()):
-        tasks += [_LesionTask(lesion, "", task.first) for lesion in lesions if lesion != EXCHANGED]
-    return dict(zip(tasks, run_tasks(_run_lesion, tasks, workers=task.workers), strict=True))
+        tasks += [(lesion, "", task.first) for lesion in lesions if lesion != EXCHANGED]
+    runs = dict(zip(tasks, run_tasks(_run_lesion, tasks, workers=task.workers), strict=True))
+    found: dict[tuple[str, str], list[_Lesioned]] = {}
+    for (lesion, row, maze), (figures, closures, true) in runs.items():
+        _, intact, _ = runs[INTACT, row, maze]
+        same = len(closures & intact) / len(intact) if intact else np.nan
+        found.setdefault((lesion, row), []).append((figures, same, true))
+    return found
 
 
-def beside_intact(
-    found: Mapping[_LesionTask, _LesionFigures], lesion: str, row: str
-) -> list[tuple[_LesionFigures, _LesionFigures]]:
-    """The sessions of a row with a lesion, each beside that of the intact network."""
-    return [
-        (one, found[task._replace(lesion=INTACT)])
-        for task, one in found.items()
-        if (task.lesion, task.row) == (lesion, row)
-    ]
-
-
-def _run_lesion(task: _LesionTask) -> _LesionFigures:
-    """Runs one session with its lesion."""
-    if task.lesion == EXCHANGED:
-        functions = foreign_activity(_record_activity(task._replace(maze=task.maze + AWAY)))
+def _run_lesion(task: tuple[str, str, int]) -> tuple[SessionFigures | None, set[tuple[int, ...]], int]:
+    """Runs one session with its lesion: its figures, its closures, and how many of them are true."""
+    lesion, row, maze = task
+    if lesion == EXCHANGED:
+        functions = foreign_activity(_record_activity(TouchTask(row, maze + AWAY)))
     else:
-        functions = LESIONS[task.lesion](task.maze)
+        functions = LESIONS[lesion](maze)
     with replaced(functions):
-        if not task.row:
+        if not row:
             claims = closure_claims(run_recording(INTEL.configuration(Path())))
             true = int((claims.accepted & (claims.distance <= FALSE_DISTANCE)).sum())
-            return _LesionFigures(None, np.flatnonzero(claims.accepted)[:, None], true)
-        result, figures = run_and_measure(TouchTask(task.row, task.maze), new_session)
+            return None, {(step,) for step in np.flatnonzero(claims.accepted).tolist()}, true
+        result, figures = run_and_measure(TouchTask(row, maze), new_session)
     true = int((closure_errors(result) <= FALSE_CLOSURE_DISTANCE).sum())
-    return _LesionFigures(figures, result.closures, true)
+    return figures, set(map(tuple, result.closures.tolist())), true
 
 
 @contextmanager
@@ -236,9 +221,9 @@ def replaced(functions: Functions) -> Iterator[None]:
         yield
 
 
-def _record_activity(task: _LesionTask) -> np.ndarray:
+def _record_activity(task: TouchTask) -> np.ndarray:
     """[n, H, Y, X] activity of the intact network after every `EVERY` steps of a session."""
-    config, log = collect_session(task_config(TouchTask(task.row, task.maze)))
+    config, log = collect_session(task_config(task))
     session = new_session(config, log)
     recorded: list[np.ndarray] = []
     for k, sample in enumerate(log):
@@ -254,57 +239,50 @@ def _order(seed: int, shape: tuple[int, ...]) -> np.ndarray:
     return stream(seed, f"cells.permuted.{'x'.join(map(str, shape))}").permutation(int(np.prod(shape)))
 
 
-def same_closures(one: _LesionFigures, other: _LesionFigures) -> float:
-    """Share of the closures of another session that are in this one, pair for pair; NaN if there are none."""
-    pairs, others = ({tuple(pair) for pair in each.closures.tolist()} for each in (one, other))
-    return len(pairs & others) / len(others) if others else np.nan
+def _lesions_and_rows(result: _Lesions) -> tuple[list[str], list[str]]:
+    """The lesions, and the rows of the touch table."""
+    lesions, rows = (dict.fromkeys(each) for each in zip(*result, strict=True))
+    return list(lesions), [row for row in rows if row]
 
 
-def _table_lesions(result: Mapping[_LesionTask, _LesionFigures]) -> list[str]:
+def _table_lesions(result: _Lesions) -> list[str]:
     """The lines of the table, and what it does not show."""
-    lesions = list(dict.fromkeys(task.lesion for task in result))
-    rows = [row for row in dict.fromkeys(task.row for task in result) if row]
-    mazes = len(beside_intact(result, INTACT, rows[0]))
-    lines = [
-        f"Medians over {mazes} mazes a row, closures are sums. Goal: "
-        + "; ".join(f"{lesion}: {goal}" for lesion, goal in GOALS.items() if lesion in lesions)
-        + ".",
-        "",
-        *markdown_header(COLUMNS).splitlines(),
-    ]
-    for row in rows:
-        lines += [markdown_row([lesion, row, *_cells(result, lesion, row)]) for lesion in lesions]
-    return [*lines, "", NOT_SHOWN]
+    lesions, names = _lesions_and_rows(result)
+    rows = []
+    for row, lesion in product(names, lesions):
+        figures = [one for one, _, _ in result[lesion, row] if one is not None]
+        same = [share for _, share, _ in result[lesion, row]]
+        intel = result.get((lesion, ""))
+        closures, false = (
+            sum(getattr(one.metrics, name) for one in figures) for name in ("closures", "false_closures")
+        )
+        rows.append(
+            [
+                lesion,
+                row,
+                f"{np.nanmedian([one.revisits_closed for one in figures]):.2f}",
+                f"{closures}, {false}",
+                f"{np.nanmedian(same):.0%}" if np.isfinite(same).any() else "-",
+                f"{np.median([one.metrics.em for one in figures]):.3f}",
+                f"{np.median([one.metrics.arr for one in figures]):.3f}",
+                intel[0][2] if intel else "-",
+            ]
+        )
+    mazes = len(result[INTACT, names[0]])
+    goals = "; ".join(f"{lesion}: {goal}" for lesion, goal in GOALS.items() if lesion in lesions)
+    above = f"Medians over {mazes} mazes a row, closures are sums. Goal: {goals}."
+    below = (
+        "Not shown: cells that fall silent in an intact network learn nothing new here, because the ties are"
+        " computed from the map; EM without closures is that of odometry. Intel's recording is one session,"
+        " and `-` means that RATSLAM_DATA is not set."
+    )
+    return table_lines([above], COLUMNS, rows, [below])
 
 
-NOT_SHOWN = (
-    "Not shown: cells that fall silent in an intact network learn nothing new here, because the ties are"
-    " computed from the map; EM without closures is that of odometry. Intel's recording is one session, and"
-    " `-` means that RATSLAM_DATA is not set."
-)
-
-
-def _cells(result: Mapping[_LesionTask, _LesionFigures], lesion: str, row: str) -> list[str]:
-    sessions = beside_intact(result, lesion, row)
-    figures = [one.figures for one, _ in sessions if one.figures is not None]
-    same = [same_closures(*pair) for pair in sessions]
-    closures = sum(one.metrics.closures for one in figures)
-    intel = beside_intact(result, lesion, "")
-    return [
-        f"{np.nanmedian([one.revisits_closed for one in figures]):.2f}",
-        f"{closures}, {sum(one.metrics.false_closures for one in figures)}",
-        f"{np.nanmedian(same):.0%}" if np.isfinite(same).any() else "-",
-        f"{np.median([one.metrics.em for one in figures]):.3f}",
-        f"{np.median([one.metrics.arr for one in figures]):.3f}",
-        str(intel[0][0].true) if intel else "-",
-    ]
-
-
-def _draw_lesions(result: Mapping[_LesionTask, _LesionFigures], png: Path) -> None:
+def _draw_lesions(result: _Lesions, png: Path) -> None:
     """Share of revisits closed, and EM, of every lesion."""
-    lesions = list(dict.fromkeys(task.lesion for task in result))
-    rows = [row for row in dict.fromkeys(task.row for task in result) if row]
-    panels = (
+    lesions, rows = _lesions_and_rows(result)
+    panels: tuple[tuple[str, str, Callable[[Any], float]], ...] = (
         ("revisits closed", "share", lambda one: one.revisits_closed),
         ("EM", "m² + rad²", lambda one: one.metrics.em),
     )
@@ -314,17 +292,14 @@ def _draw_lesions(result: Mapping[_LesionTask, _LesionFigures], png: Path) -> No
     for panel, (title, across, value) in zip(axes[0], panels, strict=True):
         for k, row in enumerate(rows):
             colour = COLOURS[k % len(COLOURS)]
-            found = [
-                [value(one.figures) for one, _ in beside_intact(result, lesion, row)] for lesion in lesions
-            ]
+            found = [[value(one) for one, _, _ in result[lesion, row]] for lesion in lesions]
             up = at + 0.2 - 0.4 * k
             panel.barh(up, np.nanmedian(found, axis=1), 0.36, color=colour, alpha=0.35, label=row)
             for y, group in zip(up, found, strict=True):
                 panel.plot(group, [y] * len(group), "o", ms=3.5, mew=0, color=colour, alpha=0.7)
         panel.set_ylim(len(lesions) - 0.5, -0.5)
         panel.set_yticks([])
-        head_panel(panel, title)
-        style.name_axes(panel, across, "")
+        name_panel(panel, title, across, "")
     for y, lesion in enumerate(lesions):
         inside = axes[0][0].get_yaxis_transform()
         axes[0][0].text(0.02, y, lesion, transform=inside, va="center", fontsize=7, color=style.INK)
@@ -343,23 +318,12 @@ CALLS = 20
 """Of which the fastest counts."""
 
 
-class _SizeTask(NamedTuple):
-    """A session of a network of `side` cells of `size` m along x and y, and whether it grows with the map."""
-
-    row: str
-    maze: int
-    side: int
-    size: float
-    grows: bool
-
-
-class _SizeFigures(NamedTuple):
-    """figures: of the session. sides: cells along x and y at its end. update: time of the network's part of
-    an update with the keyframes at its end, us."""
-
-    figures: SessionFigures
-    sides: tuple[int, int]
-    update: float
+_Network = tuple[int, float, bool]
+"""Cells along x and y, size of a cell, m, and whether the network grows with the map."""
+_Sized = tuple[SessionFigures, tuple[int, int], float]
+"""Figures of a session; cells along x and y at its end; time of the network's part of an update with the
+keyframes at its end, us."""
+_Sizes = Mapping[_Network, list[_Sized]]
 
 
 def measure_sizes(
@@ -367,24 +331,30 @@ def measure_sizes(
     row: str = "exploration",
     sides: Sequence[int] = SIDES,
     sizes: Sequence[float] = SIZES,
-) -> Mapping[_SizeTask, _SizeFigures]:
-    """The figures of networks of all sides, growing and not, and of all sizes of a cell, growing."""
-    chosen = [(side, CELL, grows) for grows in (False, True) for side in sides]
+) -> _Sizes:
+    """The figures of networks of all sides, growing and not, and of all sizes of a cell, growing; each by the
+    sessions of its mazes."""
+    chosen: list[_Network] = [(side, CELL, grows) for grows in (False, True) for side in sides]
     chosen += [(int(np.ceil(SIDE * CELL / size)), size, True) for size in sizes]
-    tasks = [_SizeTask(row, maze, *each) for each in dict.fromkeys(chosen) for maze in task.seeds(1)]
-    return dict(zip(tasks, run_tasks(_run_size, tasks, workers=task.workers), strict=True))
+    tasks = [(network, maze) for network in dict.fromkeys(chosen) for maze in task.seeds(1)]
+    found: dict[_Network, list[_Sized]] = {}
+    runs = run_tasks(partial(_run_size, row), tasks, workers=task.workers)
+    for (network, _), sized in zip(tasks, runs, strict=True):
+        found.setdefault(network, []).append(sized)
+    return found
 
 
-def _run_size(task: _SizeTask) -> _SizeFigures:
-    """Runs one session. Only the network has other cells: the lengths of recall and of the map, which the
-    product counts in cells, stay what they are with the usual ones."""
-    unit = CELL / task.size  # so much longer is a length in the network's cells
+def _run_size(row: str, task: tuple[_Network, int]) -> _Sized:
+    """Runs one session of a row and maze. Only the network has other cells: the lengths of recall and of the
+    map, which the product counts in cells, stay what they are with the usual ones."""
+    (side, size, grows), maze = task
+    unit = CELL / size  # so much longer is a length in the network's cells
     sessions: list[Session] = []
 
     def change(backend: Backend) -> None:
         assert isinstance(backend, RecallBackend)
         assert backend.cell == CELL
-        cells = PoseCellConfig(cells_xy=task.side, cell_size=task.size)
+        cells = PoseCellConfig(cells_xy=side, cell_size=size)
         backend.network = backend.network._replace(cells=cells, excite=backend.network.excite * unit)
         lengths = {
             "local_sd": backend.recall.local_sd * unit,
@@ -396,11 +366,11 @@ def _run_size(task: _SizeTask) -> _SizeFigures:
         sessions.append(new_session(config, log, change))
         return sessions[-1]
 
-    functions: Functions = {} if task.grows else {"sides_for": lambda network, poses: (task.side, task.side)}
+    functions: Functions = {} if grows else {"sides_for": lambda network, poses: (side, side)}
     with replaced(functions), patch.object(filter, "BASIN", filter.BASIN * unit):
-        _, figures = run_and_measure(TouchTask(task.row, task.maze), start)
+        _, figures = run_and_measure(TouchTask(row, maze), start)
     _, y, x = sessions[0].state.belief.activity.shape
-    return _SizeFigures(figures, (x, y), _update_time(sessions[0]))
+    return figures, (x, y), _update_time(sessions[0])
 
 
 def _update_time(session: Session) -> float:
@@ -417,65 +387,60 @@ def _update_time(session: Session) -> float:
 
     run = partial(update, belief, cells, memory.motion)
     jax.block_until_ready(run())
-    return 1e6 * min(time_call(lambda: jax.block_until_ready(run())).processor for _ in range(CALLS))
+    return 1e6 * min(time_call(lambda: jax.block_until_ready(run()))[0] for _ in range(CALLS))
 
 
-def _table_sizes(result: Mapping[_SizeTask, _SizeFigures]) -> list[str]:
+def _table_sizes(result: _Sizes) -> list[str]:
     """The lines of the table, and what it does not show."""
     columns = (
         "cells a side", "cell, m", "grows", "cells at the end", "revisits closed", "closures, false", "EM",
         "ARR", "us per update",
     )  # fmt: skip
-    mazes = len({task.maze for task in result})
-    lines = [
+    rows = []
+    for (side, size, grows), sessions in result.items():
+        figures, ends, updates = zip(*sessions, strict=True)
+        metrics = [one.metrics for one in figures]
+        closures, false = (
+            sum(getattr(one, name) for one in metrics) for name in ("closures", "false_closures")
+        )
+        rows.append(
+            [
+                side,
+                f"{size:g}",
+                "yes" if grows else "no",
+                " x ".join(map(str, ends[0])),
+                f"{np.nanmedian([one.revisits_closed for one in figures]):.2f}",
+                f"{closures}, {false}",
+                f"{np.median([one.em for one in metrics]):.3f}",
+                f"{np.median([one.arr for one in metrics]):.3f}",
+                f"{np.median(updates):.0f}",
+            ]
+        )
+    mazes = len(next(iter(result.values())))
+    above = (
         f"Free exploration, {mazes} maze{'s' * (mazes > 1)}: medians, closures are sums. The usual network"
         f" has {SIDE} cells of {CELL:g} m and grows. Goal: fewer cells than the map needs close less; finer"
-        " cells close as much.",
-        "",
-        *markdown_header(columns).splitlines(),
-    ]
-    for network, sessions in _networks(result).items():
-        side, size, grows = network
-        metrics = [one.figures.metrics for one in sessions]
-        closures = sum(one.closures for one in metrics), sum(one.false_closures for one in metrics)
-        cells = [
-            " x ".join(map(str, sessions[0].sides)),
-            f"{np.nanmedian([one.figures.revisits_closed for one in sessions]):.2f}",
-            "{}, {}".format(*closures),
-            f"{np.median([one.em for one in metrics]):.3f}",
-            f"{np.median([one.arr for one in metrics]):.3f}",
-            f"{np.median([one.update for one in sessions]):.0f}",
-        ]
-        lines.append(markdown_row([side, f"{size:g}", "yes" if grows else "no", *cells]))
-    return [
-        *lines,
-        "",
+        " cells close as much."
+    )
+    below = (
         "An update's time is of the network alone, of all threads, the least of"
-        f" {CALLS} calls. Not shown: other headings; maps of several hundred metres.",
-    ]
+        f" {CALLS} calls. Not shown: other headings; maps of several hundred metres."
+    )
+    return table_lines([above], columns, rows, [below])
 
 
-def _networks(result: Mapping[_SizeTask, _SizeFigures]) -> dict[tuple[int, float, bool], list[_SizeFigures]]:
-    """The sessions of each network: side, size of a cell, whether it grows."""
-    found: dict[tuple[int, float, bool], list[_SizeFigures]] = {}
-    for task, figures in result.items():
-        found.setdefault((task.side, task.size, task.grows), []).append(figures)
-    return found
-
-
-def _draw_sizes(result: Mapping[_SizeTask, _SizeFigures], png: Path) -> None:
+def _draw_sizes(result: _Sizes, png: Path) -> None:
     """Share of revisits closed against the cells a side and against the time of an update."""
-    networks = _networks(result)
     groups = {
-        f"{CELL:g} m, fixed": {key: one for key, one in networks.items() if not key[2]},
-        f"{CELL:g} m, grows": {key: one for key, one in networks.items() if key[1] == CELL and key[2]},
-        "other cells, grows": {key: one for key, one in networks.items() if key[1] != CELL},
+        f"{CELL:g} m, fixed": {key: one for key, one in result.items() if not key[2]},
+        f"{CELL:g} m, grows": {key: one for key, one in result.items() if key[1] == CELL and key[2]},
+        "other cells, grows": {key: one for key, one in result.items() if key[1] != CELL},
     }
     line = f"The usual network has {SIDE} cells of {CELL:g} m along x and y, and grows."
     figure, axes = panel_grid("Numbers and sizes of cells", line, 1, 2, height=2.6)
     for (label, group), colour in zip(groups.items(), COLOURS + (style.GREEN,), strict=True):
-        closed = [np.nanmedian([one.figures.revisits_closed for one in each]) for each in group.values()]
-        update = [np.median([one.update for one in each]) for each in group.values()]
+        closed = [np.nanmedian([one.revisits_closed for one, *_ in each]) for each in group.values()]
+        update = [np.median([time for *_, time in each]) for each in group.values()]
         axes[0][0].plot([side for side, *_ in group], closed, "o-", ms=4, color=colour, label=label)
         axes[0][1].plot(update, closed, "o", ms=5, color=colour)
     for panel, across in zip(axes[0], ("cells a side", "time of an update (us)"), strict=True):

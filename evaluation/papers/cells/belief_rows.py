@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,9 +33,8 @@ from evaluation.papers.cells.belief_world import (
     room_closures,
     see,
 )
-from evaluation.papers.cells.panels import head_panel, panel_grid
+from evaluation.papers.cells.panels import name_panel, panel_grid, table_lines
 from evaluation.papers.figure import Figure, Task
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 from evaluation.studies.executor import run_tasks
 from ratslam.mapping.config import KeyframeMapConfig
@@ -72,21 +70,13 @@ FINE_CELLS = PoseCellConfig(
 """Cells of half the side in x, y and heading."""
 
 
-class _Scores(NamedTuple):
-    """_Scores of n sessions by belief.
-
-    Attributes:
-        score: [n] mean over updates of the log probability of the true state over that of a uniform guess,
-            nats. single: the same over updates with one packet. inside: [n, 2] share of updates whose truth
-            is in the smallest region with the probability of `REGIONS`.
-    """
-
-    score: np.ndarray
-    single: np.ndarray
-    inside: np.ndarray
+_Scores = Mapping[str, np.ndarray]
+"""By belief [n, 4], of n sessions: mean over updates of the log probability of the true state over that of a
+uniform guess, nats; the same over updates with one packet; shares of updates whose truth is in the smallest
+region with each probability of `REGIONS`."""
 
 
-def measure_posterior(task: Task, updates: int = UPDATES) -> tuple[Mapping[str, _Scores], str]:
+def measure_posterior(task: Task, updates: int = UPDATES) -> tuple[_Scores, str]:
     """The scores of the network, of its references and of the control, and how the last two were set."""
     seeds = task.seeds(8)
     worlds = [random_world(seed, updates) for seed in seeds]
@@ -94,18 +84,17 @@ def measure_posterior(task: Task, updates: int = UPDATES) -> tuple[Mapping[str, 
     alone = [_packet(world, belief) > ONE_PACKET for world, belief in zip(worlds, best, strict=True)]
     novel = max(float(np.mean([world.truth < 0 for world in worlds])), 1 / updates)
 
-    def scores(beliefs: Sequence[np.ndarray]) -> _Scores:
-        gains = [log_gain(world, belief) for world, belief in zip(worlds, beliefs, strict=True)]
-        return _Scores(
-            np.array([gain.mean() for gain in gains]),
-            np.array([gain[one].mean() for gain, one in zip(gains, alone, strict=True)]),
-            np.array([inside(world, belief) for world, belief in zip(worlds, beliefs, strict=True)]),
-        )
+    def scores(beliefs: Sequence[np.ndarray]) -> np.ndarray:
+        rows = []
+        for world, belief, one in zip(worlds, beliefs, alone, strict=True):
+            gain = log_gain(world, belief)
+            rows.append([gain.mean(), gain[one].mean(), *inside(world, belief)])
+        return np.array(rows)
 
     controls = {
         setting: scores([additive(world, *setting, novel) for world in worlds]) for setting in ADDITIVE
     }
-    control = max(controls, key=lambda setting: float(controls[setting].score.mean()))
+    control = max(controls, key=lambda setting: float(controls[setting][:, 0].mean()))
     found = {
         EXACT: scores(best),
         MANY: scores([particles(world, seed) for world, seed in zip(worlds, seeds, strict=True)]),
@@ -165,7 +154,7 @@ def _near(world: World, places: np.ndarray) -> np.ndarray:
     return apart < BASIN * CELLS.cell_size
 
 
-def _table_posterior(result: tuple[Mapping[str, _Scores], str]) -> list[str]:
+def _table_posterior(result: tuple[_Scores, str]) -> list[str]:
     """The lines of the table, and what it does not show."""
     found, note = result
     best = found[EXACT]
@@ -173,48 +162,40 @@ def _table_posterior(result: tuple[Mapping[str, _Scores], str]) -> list[str]:
         "belief", "score, nats", "loss", "loss while there is one packet", "truth in its 50 % region",
         "in its 90 % region",
     )  # fmt: skip
-    lines = [
-        f"{len(best.score)} sessions. Score: mean log probability of the true state over that of a uniform"
+    above = [
+        f"{len(best)} sessions. Score: mean log probability of the true state over that of a uniform"
         " guess. Goal: the network loses 1 % at most, its regions hold what they say to 5 %; control: loses"
         " more.",
         note,
-        "",
-        *markdown_header(columns).splitlines(),
     ]
+    rows = []
     for name, scores in found.items():
-        loss = [
-            1 - mine.mean() / its.mean()
-            for mine, its in ((scores.score, best.score), (scores.single, best.single))
-        ]
-        cells = [f"{scores.score.mean():.3f}", *(f"{each:.2%}" for each in loss)]
-        lines.append(markdown_row([name, *cells, *(f"{each:.1%}" for each in scores.inside.mean(axis=0))]))
-    return [
-        *lines,
-        "",
-        "Not shown: likelihoods that are wrong; on a robot they are, and no inference makes up for it.",
-    ]
+        loss = (f"{1 - scores[:, k].mean() / best[:, k].mean():.2%}" for k in (0, 1))
+        held = (f"{each:.1%}" for each in scores[:, 2:].mean(axis=0))
+        rows.append([name, f"{scores[:, 0].mean():.3f}", *loss, *held])
+    below = "Not shown: likelihoods that are wrong; on a robot they are, and no inference makes up for it."
+    return table_lines(above, columns, rows, [below])
 
 
-def _draw_posterior(result: tuple[Mapping[str, _Scores], str], png: Path) -> None:
+def _draw_posterior(result: tuple[_Scores, str], png: Path) -> None:
     """Loss by session, and the regions."""
     found, _ = result
-    best = found[EXACT].score
-    loss = {name: 100 * (1 - scores.score / best) for name, scores in found.items() if name != EXACT}
-    overall = 1 - found[NETWORK].score.mean() / best.mean()
+    best = found[EXACT][:, 0]
+    loss = {name: 100 * (1 - scores[:, 0] / best) for name, scores in found.items() if name != EXACT}
+    overall = 1 - found[NETWORK][:, 0].mean() / best.mean()
     line = f"The network loses {overall:.1%} of the score of exact inference. Dots: sessions."
     figure, axes = panel_grid("The activity as a posterior", line, 1, 2, height=2.6)
     for k, (name, values) in enumerate(loss.items()):
         axes[0][0].plot([k] * len(values), values, "o", ms=4, mew=0, alpha=0.6, color=COLOURS[name])
     axes[0][0].set_xticks([])
     axes[0][0].set_yscale("symlog", linthresh=1)
-    head_panel(axes[0][0], "loss against exact inference")
-    style.name_axes(axes[0][0], "", "loss (%)")
+    name_panel(axes[0][0], "loss against exact inference", "", "loss (%)")
     for name, scores in found.items():
-        held = 100 * scores.inside.mean(axis=0)
+        held = 100 * scores[:, 2:].mean(axis=0)
         axes[0][1].plot(np.array(REGIONS) * 100, held, "o-", ms=4, color=COLOURS[name], label=name)
     axes[0][1].plot([40, 100], [40, 100], "--", color=style.GREY, lw=0.9)
-    head_panel(axes[0][1], "truth in the region")
-    style.name_axes(axes[0][1], "probability of the region (%)", "updates with the truth in it (%)")
+    across, up = "probability of the region (%)", "updates with the truth in it (%)"
+    name_panel(axes[0][1], "truth in the region", across, up)
     style.add_legend(figure, axes[0][1], columns=3)
     figure.savefig(png)
 
@@ -229,22 +210,10 @@ SIGN, DECIDED = 0.01, 0.95
 """Departure from 1/2 that shows evidence; share from which a belief has decided."""
 
 
-class _RoomsResult(NamedTuple):
-    """Beliefs in n pairs of rooms.
-
-    Attributes:
-        share: by belief, [n, T] probability of the true room over that of both. packet: by belief, [n, T] of
-            the best packet. found: by belief, [n] probability of the true room at the end. evident: [n, T]
-            bool, whether any difference has been evidence yet: exact inference has left 1/2 by `SIGN`.
-            closures, unlike: see `room_closures`, of rooms that look alike and of others.
-    """
-
-    share: Mapping[str, np.ndarray]
-    packet: Mapping[str, np.ndarray]
-    found: Mapping[str, np.ndarray]
-    evident: np.ndarray
-    closures: Sequence[tuple[int, int, int]]
-    unlike: Sequence[tuple[int, int, int]]
+_Rooms = tuple[Mapping[str, np.ndarray], np.ndarray, Sequence[Sequence[tuple[int, int, int]]]]
+"""Beliefs in n pairs of rooms: by belief [n, 3, T] the probability of the true room over that of both, that
+of the best packet, and that of the true room; [n, T] bool, whether any difference has been evidence yet, so
+that exact inference has left 1/2 by `SIGN`; see `room_closures`, of rooms that look alike and of others."""
 
 
 def alike_rooms(seed: int) -> World:
@@ -266,26 +235,23 @@ def alike_rooms(seed: int) -> World:
     return World(np.concatenate([room, other]), pace(np.ones(COURSE)), likelihood, novelty, truth, start)
 
 
-def measure_rooms(task: Task, sessions: int = 3) -> _RoomsResult:
+def measure_rooms(task: Task, sessions: int = 3) -> _Rooms:
     """The probabilities of the two rooms, and closures of so many sessions of the whole product."""
-    found: dict[str, list[tuple[np.ndarray, np.ndarray, float]]] = {}
+    rows: dict[str, list[tuple[np.ndarray, ...]]] = {}
     for seed in task.seeds(20):
         world = alike_rooms(seed)
         half = len(world.poses) // 2
         for name, belief in _beliefs(world):
             own, other = belief[:, :half].sum(axis=1), belief[:, half:-1].sum(axis=1)
-            row = own / (own + other), _packet(world, belief), float(own[-1])
-            found.setdefault(name, []).append(row)
-    share, packet, last = (
-        {name: np.array([row[k] for row in rows]) for name, rows in found.items()} for k in range(3)
-    )
-    evident = np.cumsum(np.abs(share[EXACT] - 0.5) > SIGN, axis=1) > 0
+            rows.setdefault(name, []).append((own / (own + other), _packet(world, belief), own))
+    found = {name: np.array(each) for name, each in rows.items()}
+    evident = np.cumsum(np.abs(found[EXACT][:, 0] - 0.5) > SIGN, axis=1) > 0
     seeds = range(task.first, task.first + sessions)
-    closures, unlike = (
+    closures = [
         list(run_tasks(partial(room_closures, difference=DIFFERENCE, alike=alike), seeds, task.workers))
         for alike in (True, False)
-    )
-    return _RoomsResult(share, packet, last, evident, closures, unlike)
+    ]
+    return found, evident, closures
 
 
 def _beliefs(world: World) -> Iterator[tuple[str, np.ndarray]]:
@@ -299,42 +265,40 @@ USUAL_CONTROL = (0.3, 0.5, 0.1, 0.1)
 """Of `additive`."""
 
 
-def _table_rooms(result: _RoomsResult) -> list[str]:
+def _table_rooms(result: _Rooms) -> list[str]:
     """The lines of the table, and what it does not show."""
+    found, evident, closures = result
     columns = (
         "belief", "before: farthest from 1/2", "best packet, largest", "decided too early",
         "at the end: median", "worst", "probability of the true room, median",
         "farthest from exact inference, any time",
     )  # fmt: skip
-    pairs, early = len(result.evident), ~result.evident
-    lines = [
-        f"{pairs} pairs of rooms, {COURSE} updates; the first difference is after {DIFFERENCE}. Share of the"
-        f" true room in what the belief holds in both. Before: until exact inference leaves 1/2 by {SIGN:g}."
-        f" Decided: a share beyond {DECIDED:g}. Goal: 1/2 before, none decided too early, 1 at the end;"
-        " control: keeps both.",
-        "",
-        *markdown_header(columns).splitlines(),
-    ]
-    for name, share in result.share.items():
+    early = ~evident
+    above = (
+        f"{len(evident)} pairs of rooms, {COURSE} updates; the first difference is after {DIFFERENCE}. Share"
+        f" of the true room in what the belief holds in both. Before: until exact inference leaves 1/2 by"
+        f" {SIGN:g}. Decided: a share beyond {DECIDED:g}. Goal: 1/2 before, none decided too early, 1 at the"
+        " end; control: keeps both."
+    )
+    rows = []
+    for name, belief in found.items():
+        share, packet, room = belief.transpose(1, 0, 2)
         before, after = np.abs(share[early] - 0.5), share[:, -1]
         decided = (np.abs(share - 0.5) > DECIDED - 0.5) & early
-        apart = np.abs(share - result.share[EXACT]).max()
-        cells = [
-            f"{before.max():.3f}",
-            f"{result.packet[name][early].max():.3f}",
-            decided.any(axis=1).sum(),
-            *(
-                f"{each:.3f}"
-                for each in (np.median(after), after.min(), np.median(result.found[name]), apart)
-            ),
-        ]
-        lines.append(markdown_row([name, *cells]))
-    both = (result.closures, result.unlike)
-    alike, unlike = (np.array(each, int).reshape(-1, 3).sum(axis=0).tolist() for each in both)
-    return [
-        *lines,
-        "",
-        f"{len(result.closures)} sessions of the whole product with given place ids. Until the first"
+        apart = np.abs(share - found[EXACT][:, 0]).max()
+        ends = np.median(after), after.min(), np.median(room[:, -1]), apart
+        rows.append(
+            [
+                name,
+                f"{before.max():.3f}",
+                f"{packet[early].max():.3f}",
+                decided.any(axis=1).sum(),
+                *(f"{each:.3f}" for each in ends),
+            ]
+        )
+    alike, unlike = (np.array(each, int).reshape(-1, 3).sum(axis=0).tolist() for each in closures)
+    below = [
+        f"{len(closures[0])} sessions of the whole product with given place ids. Until the first"
         f" difference: {alike[0]} closures (goal: 0; control, rooms that do not look alike: {unlike[0]}). At"
         f" the end of the lap: {alike[1]} into the room of the robot, {alike[2]} elsewhere (control:"
         f" {unlike[1]}, {unlike[2]}).",
@@ -342,24 +306,25 @@ def _table_rooms(result: _RoomsResult) -> list[str]:
         " two equal packets are at the edge of one. Not shown: a room that is not in the map, for which any"
         " belief takes one that is.",
     ]
+    return table_lines([above], columns, rows, below)
 
 
-def _draw_rooms(result: _RoomsResult, png: Path) -> None:
+def _draw_rooms(result: _Rooms, png: Path) -> None:
     """Share of the true room over time."""
+    found, *_ = result
     line = "Share of the true room in what the belief holds in both; dashed: the first difference."
-    figure, axes = panel_grid("Two rooms that look alike", line, 1, len(result.share), height=2.4)
-    for panel, (name, share) in zip(axes[0], result.share.items(), strict=True):
-        panel.plot(share.T, color=COLOURS[name], lw=0.9, alpha=0.5)
+    figure, axes = panel_grid("Two rooms that look alike", line, 1, len(found), height=2.4)
+    for panel, (name, belief) in zip(axes[0], found.items(), strict=True):
+        panel.plot(belief[:, 0].T, color=COLOURS[name], lw=0.9, alpha=0.5)
         panel.axvline(DIFFERENCE, color=style.GREY, ls="--", lw=0.9)
         panel.set_ylim(-0.02, 1.02)
-        head_panel(panel, name)
-        style.name_axes(panel, "update", "share of the true room")
+        name_panel(panel, name, "update", "share of the true room")
     figure.savefig(png)
 
 
 KIDNAP, AFTER = 40, 80
 """Updates before and after a kidnap."""
-_Kidnaps = tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]
+_Kidnaps = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """By belief: [n] updates from the kidnap until more than half of the belief is at the true place, inf: not
 within `AFTER`; [n, T] probability of novelty."""
 
@@ -387,10 +352,10 @@ def measure_kidnaps(task: Task) -> _Kidnaps:
             held = (belief[KIDNAP:, :-1] * near[KIDNAP:]).sum(axis=1) > 0.5
             steps = float(held.argmax()) + 1 if held.any() else np.inf
             found.setdefault(name, []).append((steps, belief[:, -1]))
-    return (
-        {name: np.array([steps for steps, _ in each]) for name, each in found.items()},
-        {name: np.array([novelty for _, novelty in each]) for name, each in found.items()},
-    )
+    return {
+        name: (np.array([steps for steps, _ in each]), np.array([novelty for _, novelty in each]))
+        for name, each in found.items()
+    }
 
 
 NO_ENTRY = "network without re-entry (control)"
@@ -398,53 +363,47 @@ NO_ENTRY = "network without re-entry (control)"
 
 def _table_kidnaps(result: _Kidnaps) -> list[str]:
     """The lines of the table, and what it does not show."""
-    found_after, novelties = result
     columns = (
         "belief", "found again", "updates until then: median", "slowest tenth", "novelty before", "its peak",
         "novelty at the end",
     )  # fmt: skip
-    count = len(found_after[EXACT])
-    lines = [
+    count = len(result[EXACT][0])
+    above = (
         f"{count} kidnaps, {AFTER} updates each. Found: more than half of the belief within two pose cells of"
-        " the true place. Goal: as fast as exact inference; controls: later or never.",
-        "",
-        *markdown_header(columns).splitlines(),
-    ]
-    for name, steps in found_after.items():
-        novelty = np.median(novelties[name], axis=0)
-        late = [np.median(steps), np.quantile(steps, 0.9, method="higher")]
-        cells = [f"{each:.0f}" if np.isfinite(each) else "never" for each in late]
-        levels = [novelty[KIDNAP - 1], novelty[KIDNAP:].max(), novelty[-1]]
+        " the true place. Goal: as fast as exact inference; controls: later or never."
+    )
+    rows = []
+    for name, (steps, novelties) in result.items():
+        novelty = np.median(novelties, axis=0)
+        late = np.median(steps), np.quantile(steps, 0.9, method="higher")
+        cells = (f"{each:.0f}" if np.isfinite(each) else "never" for each in late)
+        levels = novelty[KIDNAP - 1], novelty[KIDNAP:].max(), novelty[-1]
         found = f"{np.isfinite(steps).sum()} of {count}"
-        lines.append(markdown_row([name, found, *cells, *(f"{each:.3f}" for each in levels)]))
-    return [
-        *lines,
-        "",
+        rows.append([name, found, *cells, *(f"{each:.3f}" for each in levels)])
+    below = (
         "Novelty is the median over kidnaps; that of additive injection is a constant, and at the settings of"
         " its best score it holds half of its activity nowhere. Without re-entry, what is left of the belief"
-        " spreads along the path. Not shown: kidnaps to places outside the map.",
-    ]
+        " spreads along the path. Not shown: kidnaps to places outside the map."
+    )
+    return table_lines([above], columns, rows, [below])
 
 
 def _draw_kidnaps(result: _Kidnaps, png: Path) -> None:
     """Novelty over time, and how many are found again."""
-    found_after, novelties = result
-    line = f"Found again by the network: {np.isfinite(found_after[NETWORK]).mean():.0%}. Dashed: the kidnap."
-    figure, axes = panel_grid("Kidnap", line, 1, 2, height=2.6)
-    colours = {**COLOURS, NO_ENTRY: style.PURPLE}
-    for name, steps in found_after.items():
+    share = np.isfinite(result[NETWORK][0]).mean()
+    line = f"Found again by the network: {share:.0%}. Dashed: the kidnap."
+    figure, ((left, right),) = panel_grid("Kidnap", line, 1, 2, height=2.6)
+    for name, (steps, novelties) in result.items():
+        colour = style.PURPLE if name == NO_ENTRY else COLOURS[name]
         within = [(steps <= k).mean() for k in range(AFTER + 1)]
-        axes[0][1].plot(range(AFTER + 1), within, color=colours[name], lw=1.6, label=name)
-        if name == CONTROL:
-            continue
-        novelty = np.median(novelties[name], axis=0)
-        axes[0][0].plot(np.arange(len(novelty)) - KIDNAP, novelty, color=colours[name], lw=1.6)
-    axes[0][0].axvline(0, color=style.GREY, ls="--", lw=0.9)
-    head_panel(axes[0][0], "novelty, median")
-    style.name_axes(axes[0][0], "updates since the kidnap", "novelty")
-    head_panel(axes[0][1], "found again")
-    style.name_axes(axes[0][1], "updates since the kidnap", "share of kidnaps")
-    style.add_legend(figure, axes[0][1], columns=2)
+        right.plot(range(AFTER + 1), within, color=colour, lw=1.6, label=name)
+        if name != CONTROL:
+            novelty = np.median(novelties, axis=0)
+            left.plot(np.arange(len(novelty)) - KIDNAP, novelty, color=colour, lw=1.6)
+    left.axvline(0, color=style.GREY, ls="--", lw=0.9)
+    name_panel(left, "novelty, median", "updates since the kidnap", "novelty")
+    name_panel(right, "found again", "updates since the kidnap", "share of kidnaps")
+    style.add_legend(figure, right, columns=2)
     figure.savefig(png)
 
 
@@ -508,22 +467,17 @@ def _table_conflicts(result: _Weights) -> list[str]:
         "cues, with their reliability", "degrees apart", *(f"weight of the first: {name}" for name in names),
         "network - exact, largest",
     )  # fmt: skip
-    lines = [
+    above = (
         f"Weight after {READ} views; largest difference over {LONG} updates and all turns of the headings"
-        " against the cells. Goal: the network's weights are those of exact inference.",
-        "",
-        *markdown_header(columns).splitlines(),
-    ]
+        " against the cells. Goal: the network's weights are those of exact inference."
+    )
+    rows = []
     for case, angle in product(CASES, ANGLES):
-        weights = [result[case, angle, name] for name in names]
         apart = np.abs(result[case, angle, NETWORK] - result[case, angle, EXACT]).max()
-        cells = [f"{each[:, READ - 1].mean():.3f}" for each in weights]
-        lines.append(markdown_row([case, angle, *cells, f"{apart:.3f}"]))
-    return [
-        *lines,
-        "",
-        "A view is of all headings with the rest of its reliability. Not shown: cues that turn slowly.",
-    ]
+        weights = (result[case, angle, name][:, READ - 1].mean() for name in names)
+        rows.append([case, angle, *(f"{each:.3f}" for each in weights), f"{apart:.3f}"])
+    below = "A view is of all headings with the rest of its reliability. Not shown: cues that turn slowly."
+    return table_lines([above], columns, rows, [below])
 
 
 def _draw_conflicts(result: _Weights, png: Path) -> None:
@@ -537,8 +491,7 @@ def _draw_conflicts(result: _Weights, png: Path) -> None:
             mark = "o" if name == NETWORK else "-"
             panel.plot(ANGLES, weights, mark, color=COLOURS[name], lw=1.6, ms=5, label=name)
         panel.set_ylim(-0.02, 1.02)
-        head_panel(panel, case)
-        style.name_axes(panel, "degrees apart", "weight")
+        name_panel(panel, case, "degrees apart", "weight")
     style.add_legend(figure, axes[0][0])
     figure.savefig(png)
 

@@ -11,20 +11,24 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import fft
 
 from evaluation.cells.rate_map import bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
+from evaluation.papers.cells.panels import name_panel, table_lines
+from evaluation.papers.cells.rat_sessions import (
+    RatSessions,
+    choose_columns,
+    column_activity,
+    rat_config,
+    rat_source,
+)
 from evaluation.papers.figure import Figure, Task
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
-from ratslam.network.config import PoseCellConfig
-from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 
 RATE = 10.0
@@ -56,17 +60,10 @@ _FLAT = 1e-12
 """A variance below this share of the mean square is rounding: the map is flat."""
 
 
-class _Alignment(NamedTuple):
-    """The turn and shift common to all cells at which the mean correlation of their maps is highest.
-
-    Attributes:
-        angle: of the second box, rad anticlockwise. shift: (x, y) added afterwards, bins, from 0 to below the
-            bins of the torus. correlation: [C] of each cell there; NaN where one of its maps is flat.
-    """
-
-    angle: float
-    shift: tuple[int, int]
-    correlation: np.ndarray
+_Alignment = tuple[float, tuple[int, int], np.ndarray]
+"""The turn and shift common to all cells at which the mean correlation of their maps is highest: angle of the
+second box, rad anticlockwise; (x, y) added afterwards, bins, from 0 to below the bins of the torus; [C]
+correlation of each cell there, NaN where one of its maps is flat."""
 
 
 def align_maps(first: np.ndarray, second: np.ndarray, bins: int, angles: Sequence[float]) -> _Alignment:
@@ -77,14 +74,14 @@ def align_maps(first: np.ndarray, second: np.ndarray, bins: int, angles: Sequenc
             in bins of the maps: shifts wrap round it. angles: to try, rad.
     """
     laid = lay_on_torus(first, bins, 0.0)
-    best = _Alignment(np.nan, (0, 0), np.full(len(first), -np.inf))
+    best: _Alignment = np.nan, (0, 0), np.full(len(first), -np.inf)
     for angle in angles:
         fits = correlate_shifts(laid, lay_on_torus(second, bins, angle))
         known = np.isfinite(fits)
         mean = np.where(known, fits, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
         y, x = np.unravel_index(mean.argmax(), mean.shape)
-        if mean[y, x] > mean_correlation(best.correlation):
-            best = _Alignment(float(angle), (int(x), int(y)), fits[:, y, x])
+        if mean[y, x] > mean_correlation(best[2]):
+            best = float(angle), (int(x), int(y)), fits[:, y, x]
     return best
 
 
@@ -142,34 +139,14 @@ def _parts(maps: np.ndarray) -> np.ndarray:
     return np.array([known.astype(float), values, values**2])
 
 
-class _MapFit(NamedTuple):
-    """How well maps of n cells fit. still: [n] correlation as they are. best: after the best common turn and
-    shift. shuffled_still, shuffled_best: the same with the identities of the cells shuffled."""
-
-    still: np.ndarray
-    best: _Alignment
-    shuffled_still: np.ndarray
-    shuffled_best: _Alignment
-
-
-class _BoxSession(NamedTuple):
-    """One session.
-
-    Attributes:
-        maps: [3, n, H, W] of columns in A, in A again and in B. again, moved: fits of these: A with A and A
-            with B. single_again, single_moved: those of one cell of each column. turn: of the sheet against B
-            as the rat was set down, rad.
-    """
-
-    maps: np.ndarray
-    again: _MapFit
-    moved: _MapFit
-    single_again: _MapFit
-    single_moved: _MapFit
-    turn: float
-
-
-_Boxes = tuple[list[_BoxSession], float, float]
+KINDS, PAIRS = ("columns", "single cells"), ("A with A", "A with B")
+_Fit = tuple[dict[str, np.ndarray], float, tuple[int, int]]
+"""Correlations [n] of maps as they are (`still`) and after the best common turn and shift (`best`), each also
+with the identities of the cells shuffled (`shuffled still`, ...); that turn, rad, and that shift, bins."""
+_Session = tuple[np.ndarray, dict[tuple[str, str], _Fit], float]
+"""Maps [3, n, H, W] of columns in A, in A again and in B; the fits of `KINDS` and `PAIRS`; turn of the sheet
+against B as the rat was set down, rad."""
+_Boxes = tuple[list[_Session], float, float]
 
 
 def measure_boxes(task: Task, seconds: float = SECONDS, columns: int = COLUMNS) -> _Boxes:
@@ -196,102 +173,121 @@ def measure_boxes(task: Task, seconds: float = SECONDS, columns: int = COLUMNS) 
     return sessions, side, network.cells_xy * network.cell_size
 
 
-def _fit_session(recording: CellRecording, seconds: float, side: float, columns: int) -> _BoxSession:
+def _fit_session(recording: CellRecording, seconds: float, side: float, columns: int) -> _Session:
     """The fits of a recording of columns in three parts of equal duration: A, A again, and B of the same
     size, with bins of one cell."""
     count = round(side / recording.cell_size)
     edges = np.linspace(0.0, side, count + 1)
     part = np.minimum((recording.time - recording.time[0]) // seconds, 2)
-    all_maps = []
-    for activity in (sum_columns(recording.activity, columns), one_of_each(recording.activity, columns)):
-        sums = [
-            bin_activity(recording.time[here], recording.truth[here], activity[here], edges, edges)
+    maps: dict[str, list[np.ndarray]] = {}
+    for kind, activity in zip(KINDS, column_activity(recording.activity, columns), strict=True):
+        maps[kind] = [
+            rate_maps(bin_activity(recording.time[here], recording.truth[here], activity[here], edges, edges))
             for here in (part == number for number in range(3))
         ]
-        all_maps.append([rate_maps(each) for each in sums])
-    bins = recording.shape[2]
-    again, moved, single_again, single_moved = (
-        fit_maps(maps[k], maps[k + 1], bins) for maps in all_maps for k in (0, 1)
-    )
+    fits = {
+        (kind, pair): fit_maps(maps[kind][k], maps[kind][k + 1], recording.shape[2])
+        for kind in KINDS
+        for k, pair in enumerate(PAIRS)
+    }
     after = int(np.flatnonzero(part == 2)[0])
     turn = wrap(recording.truth[after - 1, 2] - recording.truth[after, 2])
-    maps = np.array(all_maps[0])
-    return _BoxSession(maps, again, moved, single_again, single_moved, float(turn))
+    return np.array(maps["columns"]), fits, float(turn)
 
 
-def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> _MapFit:
+def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> _Fit:
     """The fit of maps [n, H, W] with others of the same cells on a torus of so many bins a side.
 
     Shuffled identities: each cell is compared with the next one; cells are drawn in no order.
     """
-    other = np.roll(second, 1, axis=0)
-    still = [
-        correlate_shifts(lay_on_torus(first, bins, 0.0), lay_on_torus(each, bins, 0.0))[:, 0, 0]
-        for each in (second, other)
-    ]
-    best = [align_maps(first, each, bins, ANGLES.tolist()) for each in (second, other)]
-    return _MapFit(still[0], best[0], still[1], best[1])
+    laid, other = lay_on_torus(first, bins, 0.0), np.roll(second, 1, axis=0)
+    still, shuffled = (
+        correlate_shifts(laid, lay_on_torus(each, bins, 0.0))[:, 0, 0] for each in (second, other)
+    )
+    angle, shift, best = align_maps(first, second, bins, ANGLES.tolist())
+    fits = {"still": still, "best": best, "shuffled still": shuffled}
+    return fits | {"shuffled best": align_maps(first, other, bins, ANGLES.tolist())[2]}, angle, shift
 
 
 def _table_boxes(result: _Boxes) -> list[str]:
     """The lines of the table, and what it does not show."""
     sessions, side, torus = result
-    lines = [
-        f"Sessions: {len(sessions)}, of {sessions[0].maps.shape[1]} columns. Correlations: mean over cells, "
-        "then the lowest and the highest session.",
-        "",
-        *markdown_header(("figure", "expectation", "measured", "control")).splitlines(),
+
+    def spread(kind: str, pair: str, name: str) -> str:
+        means = [mean_correlation(fits[kind, pair][0][name]) for _, fits, _ in sessions]
+        return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
+
+    figures = (
+        ("A with A", "no shift", "high", "still"),
+        ("A with B", "no shift", "about 0: the sheet has turned and shifted", "still"),
+        (
+            "A with B",
+            "best common turn and shift",
+            "far above the control: the sheet turns and shifts as a whole",
+            "best",
+        ),
+    )
+    rows = [
+        [
+            f"{kind}: {pair}, {how}",
+            goal,
+            spread(kind, pair, name),
+            f"{spread(kind, pair, f'shuffled {name}')} shuffled identities",
+        ]
+        for kind in KINDS
+        for pair, how, goal, name in figures
     ]
-    for kind, name in (("", "columns"), ("single_", "single cells")):
-        again = [getattr(each, f"{kind}again") for each in sessions]
-        moved = [getattr(each, f"{kind}moved") for each in sessions]
-        rows = (
-            ("A with A, no shift", "high", again, "still"),
-            ("A with B, no shift", "about 0: the sheet has turned and shifted", moved, "still"),
-            (
-                "A with B, best common turn and shift",
-                "far above the control: the sheet turns and shifts as a whole",
-                moved,
-                "best",
-            ),
-        )
-        for figure, goal, fits, field in rows:
-            control = f"{_range(fits, f'shuffled_{field}')} shuffled identities"
-            lines.append(markdown_row([f"{name}: {figure}", goal, _range(fits, field), control]))
-    found = ", ".join(f"{np.degrees(wrap(each.moved.best.angle)):.0f}" for each in sessions)
-    down = ", ".join(f"{np.degrees(each.turn):.0f}" for each in sessions)
-    lines.append(markdown_row(["common turn, degrees", "that of setting down", found, f"{down} set down"]))
-    ratio = f"{side:.2f} / {torus:.2f} m = {side / torus:.2f}"
-    lines.append(markdown_row(["box over torus", "-", ratio, "-"]))
-    return [*lines, "", NOT_SHOWN]
+    found = ", ".join(f"{np.degrees(wrap(fits['columns', 'A with B'][1])):.0f}" for _, fits, _ in sessions)
+    down = ", ".join(f"{np.degrees(turn):.0f}" for _, _, turn in sessions)
+    rows.append(["common turn, degrees", "that of setting down", found, f"{down} set down"])
+    rows.append(["box over torus", "-", f"{side:.2f} / {torus:.2f} m = {side / torus:.2f}", "-"])
+    above = (
+        f"Sessions: {len(sessions)}, of {sessions[0][0].shape[1]} columns. Correlations: mean over cells, "
+        "then the lowest and the highest session."
+    )
+    below = (
+        "A rigid torus has one map, which it can only turn and shift as a whole: a high correlation after"
+        " that is built in, and global remapping of place cells cannot be shown by it. Activity is a rate,"
+        " without spikes and without theta. A column is the cells of one place on the torus, every third"
+        " heading."
+    )
+    return table_lines([above], ("figure", "expectation", "measured", "control"), rows, [below])
 
 
-NOT_SHOWN = (
-    "A rigid torus has one map, which it can only turn and shift as a whole: a high correlation after that "
-    "is built in, and global remapping of place cells cannot be shown by it. Activity is a rate, without "
-    "spikes and without theta. A column is the cells of one place on the torus, every third heading."
-)
+SHOWN = 7
+"""Columns whose maps are drawn."""
+SIDE, GAP, MARGIN = 0.82, 0.09, 1.08
+"""Inches: of a map, between maps, left of them."""
+HEIGHT, LOW = 1.7, 0.95
+"""Inches: of a histogram, below it."""
+COLOURS = (style.GREY, style.BLUE, style.VERMILLION)
+BINS = np.linspace(-1.0, 1.0, 41)
 
 
 def _draw_boxes(result: _Boxes, png: Path) -> None:
     """Maps of some columns in each box, and histograms of the correlations of all columns."""
     sessions, side, torus = result
-    found = sessions[0].moved.best
-    pairs: dict[str, dict[str, np.ndarray]] = {}
-    for title, field in (("as they are", "still"), ("after the best common turn and shift", "best")):
-        fits = {
-            "A with A": ([each.again for each in sessions], field),
-            "A with B": ([each.moved for each in sessions], field),
-            "A with B, identities shuffled": ([each.moved for each in sessions], f"shuffled_{field}"),
+    maps, fits, _ = sessions[0]
+    _, angle, shift = fits["columns", "A with B"]
+
+    def correlations(pair: str, name: str) -> np.ndarray:
+        """Of all columns of all sessions that have one."""
+        joined = np.concatenate([fits["columns", pair][0][name] for _, fits, _ in sessions])
+        return joined[np.isfinite(joined)]
+
+    pairs = {
+        title: {
+            "A with A": correlations("A with A", name),
+            "A with B": correlations("A with B", name),
+            "A with B, identities shuffled": correlations("A with B", f"shuffled {name}"),
         }
-        pairs[title] = {name: _correlations(*each) for name, each in fits.items()}
-    bins = round(torus / side * sessions[0].maps.shape[2])
-    first, again, plain = (lay_on_torus(maps, bins, 0.0) for maps in sessions[0].maps)
-    other = lay_on_torus(sessions[0].maps[2], bins, found.angle)
-    fitted = np.roll(other, found.shift[::-1], axis=(1, 2))
-    turned = f"B turned\n{np.degrees(found.angle):.0f}°, shifted"
-    rows = {"A": first, "A again": again, "B": plain, turned: fitted}
-    still, best = (_mean(each["A with B"]) for each in pairs.values())
+        for title, name in (("as they are", "still"), ("after the best common turn and shift", "best"))
+    }
+    bins = round(torus / side * maps.shape[2])
+    first, again, plain = (lay_on_torus(each, bins, 0.0) for each in maps)
+    fitted = np.roll(lay_on_torus(maps[2], bins, angle), shift[::-1], axis=(1, 2))
+    rows = {"A": first, "A again": again, "B": plain, f"B turned\n{np.degrees(angle):.0f}°, shifted": fitted}
+    still, best = (mean_correlation(each["A with B"]) for each in pairs.values())
     line = (
         f"Box {side:g} m, torus {torus:g} m (ratio {side / torus:.2f}). Mean "
         f"correlation of A with B: {still:.2f}, after one turn and shift of all {best:.2f}."
@@ -299,13 +295,13 @@ def _draw_boxes(result: _Boxes, png: Path) -> None:
     step = SIDE + GAP
     height = style.TOP + 0.2 + len(rows) * step + 0.75 + HEIGHT + LOW
     figure = style.new_figure(height, "Rate maps in two boxes", line)
-    for k, (name, maps) in enumerate(rows.items()):
+    for k, (name, shown) in enumerate(rows.items()):
         bottom = height - style.TOP - 0.2 - SIDE - k * step
         figure.text(
             (MARGIN - 0.12) / style.WIDTH, (bottom + SIDE / 2) / height, name, ha="right", va="center",
             fontsize=9, color=style.INK,
         )  # fmt: skip
-        for column, rates in enumerate(maps[:SHOWN]):
+        for column, rates in enumerate(shown[:SHOWN]):
             axes = style.add_axes(figure, MARGIN + column * step, bottom, SIDE, SIDE)
             peak = max(np.nanmax(rates), np.finfo(float).tiny)
             image = axes.imshow(
@@ -328,35 +324,6 @@ def _draw_boxes(result: _Boxes, png: Path) -> None:
     figure.savefig(png)
 
 
-def _correlations(fits: list[_MapFit], field: str) -> np.ndarray:
-    values = [getattr(each, field) for each in fits]
-    joined = np.concatenate([each.correlation if isinstance(each, _Alignment) else each for each in values])
-    return joined[np.isfinite(joined)]
-
-
-def _mean(values: np.ndarray) -> float:
-    """The mean; NaN of none, as in a short session."""
-    return float(values.mean()) if len(values) else np.nan
-
-
-def _range(fits: list[_MapFit], field: str) -> str:
-    means = [_mean(_correlations([each], field)) for each in fits]
-    return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
-
-
-FIGURE = Figure("Rate maps in two boxes", measure_boxes, _table_boxes, _draw_boxes)
-
-
-SHOWN = 7
-"""Columns whose maps are drawn."""
-SIDE, GAP, MARGIN = 0.82, 0.09, 1.08
-"""Inches: of a map, between maps, left of them."""
-HEIGHT, LOW = 1.7, 0.95
-"""Inches: of a histogram, below it."""
-COLOURS = (style.GREY, style.BLUE, style.VERMILLION)
-BINS = np.linspace(-1.0, 1.0, 41)
-
-
 def _draw_histograms(figure: style.Figure, pairs: Mapping[str, Mapping[str, np.ndarray]]) -> style.Axes:
     gap = 0.7
     width = (style.WIDTH - style.LEFT - style.RIGHT - (len(pairs) - 1) * gap) / len(pairs)
@@ -368,33 +335,9 @@ def _draw_histograms(figure: style.Figure, pairs: Mapping[str, Mapping[str, np.n
                 axes.axvline(values.mean(), color=colour, lw=1.4, ls="--")
         axes.grid(color=style.LINE_GREY, lw=0.7)
         axes.set(xlim=(-1, 1), xticks=(-1, -0.5, 0, 0.5, 1))
-        axes.set_title(title, fontsize=9.5, color=style.INK, loc="left")
-        style.name_axes(
-            axes, "correlation of two maps of a column (dashed: mean)", "columns" if k == 0 else ""
-        )
+        across = "correlation of two maps of a column (dashed: mean)"
+        name_panel(axes, title, across, "columns" if k == 0 else "")
     return axes
 
 
-EVERY = 3
-"""Every third heading is recorded: the packet is wider than the gap."""
-
-
-def choose_columns(config: PoseCellConfig, count: int, seed: int) -> list[list[int]]:
-    """Indices [x, y, heading] of the cells of `count` columns, drawn without repeats; a setting
-    `cells.chosen`."""
-    side = config.cells_xy
-    drawn = stream(seed, "cells.columns").permutation(side * side)[:count].tolist()
-    headings = range(0, config.cells_heading, EVERY)
-    return [[at % side, at // side, heading] for at in drawn for heading in headings]
-
-
-def sum_columns(activity: np.ndarray, columns: int) -> np.ndarray:
-    """[T, columns] activity of columns, from that of their cells [T, C]."""
-    return activity.reshape(len(activity), columns, -1).sum(axis=2)
-
-
-def one_of_each(activity: np.ndarray, columns: int) -> np.ndarray:
-    """[T, columns] activity of one cell of each column, at a heading that differs from column to column."""
-    split = activity.reshape(len(activity), columns, -1)
-    at = np.arange(columns)
-    return split[:, at, at % split.shape[2]]
+FIGURE = Figure("Rate maps in two boxes", measure_boxes, _table_boxes, _draw_boxes)

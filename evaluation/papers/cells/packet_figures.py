@@ -13,22 +13,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from evaluation.cells.recording import CellRecording
 from evaluation.papers.cells.panels import (
     error_size,
-    head_panel,
+    name_panel,
     panel_grid,
     shortest,
     spread_dots,
+    table_lines,
     torus_error,
 )
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
 from evaluation.papers.figure import Figure, Task
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 from evaluation.studies.study_course import StudyCourse, expected_poses, read_course
 from ratslam.classic.batch import CellSets, Network, walk
@@ -58,41 +58,22 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class Noise(NamedTuple):
-    """Noise of odometry. speed: sqrt(s). heading: rad / sqrt(s)."""
-
-    speed: float
-    heading: float
-
-    def __str__(self) -> str:
-        if self.speed:
-            return f"speed {self.speed:g} sqrt(s)"
-        return f"heading {self.heading:g} rad / sqrt(s)" if self.heading else "none"
-
-
-LEVELS = (Noise(0.0, 0.0), *(Noise(each, 0.0) for each in SPEED), *(Noise(0.0, each) for each in HEADING))
-"""One block of networks."""
+LEVELS = {
+    "none": (0.0, 0.0),
+    **{f"speed {each:g} sqrt(s)": (each, 0.0) for each in SPEED},
+    **{f"heading {each:g} rad / sqrt(s)": (0.0, each) for each in HEADING},
+}
+"""Noise of the speed and of the heading by name: one block of networks."""
+_Drift = tuple[tuple[int, ...], Sequence[np.ndarray]]
+"""M times, s, and sizes [n, L, M, 2] (m and rad) of the errors of n seeds at L levels: of the packet and of
+odometry against the true pose, and of the packet against integrated odometry."""
 
 
-class _DriftResult(NamedTuple):
-    """Errors of n seeds at L levels of noise and at M times.
-
-    Attributes:
-        times: [M] s. packet, odometry: [n, L, M, 2] size of the error against the true pose, m and rad.
-            added: [n, L, M, 2] of the packet against integrated odometry.
-    """
-
-    times: tuple[int, ...]
-    packet: np.ndarray
-    odometry: np.ndarray
-    added: np.ndarray
-
-
-def measure_drift(task: Task, times: tuple[int, ...] = TIMES) -> _DriftResult:
+def measure_drift(task: Task, times: tuple[int, ...] = TIMES) -> _Drift:
     """The errors of all seeds after the given times, s."""
     prepare_precision("float64")
     found = [_errors_of(seed, times) for seed in task.seeds(USUAL)]
-    return _DriftResult(times, *(np.array(each) for each in zip(*found, strict=True)))
+    return times, [np.array(each) for each in zip(*found, strict=True)]
 
 
 def rms(errors: np.ndarray) -> np.ndarray:
@@ -100,66 +81,55 @@ def rms(errors: np.ndarray) -> np.ndarray:
     return np.sqrt((errors**2).mean(axis=0))
 
 
-def _table_drift(result: _DriftResult) -> list[str]:
+def _table_drift(result: _Drift) -> list[str]:
     """The lines of the table, and what it does not show."""
-    packet, odometry, added = rms(result.packet), rms(result.odometry), rms(result.added)
-    lines = [
-        f"Root mean square over {len(result.packet)} seeds; a cell is 0.05 m and {np.radians(10):.2f} rad.",
+    times, errors = result
+    packet, odometry, added = map(rms, errors)
+    above = [
+        f"Root mean square over {len(errors[0])} seeds; a cell is 0.05 m and {np.radians(10):.2f} rad.",
         "Goal: the packet adds little to the error of odometry; heading: noise times the root of the time.",
-        "",
-        *markdown_header(COLUMNS).splitlines(),
     ]
-    for k, level in enumerate(LEVELS):
-        for j, time in enumerate(result.times):
+    rows = []
+    for k, (level, (_, heading)) in enumerate(LEVELS.items()):
+        for j, time in enumerate(times):
             (m, rad), (m_o, rad_o), (m_a, rad_a) = packet[k, j], odometry[k, j], added[k, j]
-            expected = level.heading * np.sqrt(time)
-            cells = [m, m_o, m_a, rad, expected, rad_o, rad_a]
-            lines.append(markdown_row([str(level), str(time), *(f"{each:.3f}" for each in cells)]))
-    return [*lines, "", NOT_SHOWN]
+            cells = [m, m_o, m_a, rad, heading * np.sqrt(time), rad_o, rad_a]
+            rows.append([level, time, *(f"{each:.3f}" for each in cells)])
+    below = (
+        "Not shown: noise inside the network, which has none; the packet drifts because odometry does, and"
+        " with a few seeds a root mean square is uncertain by a third."
+    )
+    return table_lines(above, COLUMNS, rows, [below])
 
 
-NOT_SHOWN = (
-    "Not shown: noise inside the network, which has none; the packet drifts because odometry does, and with a"
-    " few seeds a root mean square is uncertain by a third."
-)
-
-
-def _draw_drift(result: _DriftResult, png: Path) -> None:
+def _draw_drift(result: _Drift, png: Path) -> None:
     """Errors of position and heading against the noise of speed and of heading."""
-    most = float(result.added[..., 0].max()), float(result.added[..., 1].max())
+    times, (packets, odometries, added) = result
     line = (
-        f"Dots: {len(result.packet)} seeds, lines: root mean square. "
-        f"The packet adds at most {most[0]:.3f} m, {most[1]:.3f} rad to odometry."
+        f"Dots: {len(packets)} seeds, lines: root mean square. "
+        f"The packet adds at most {added[..., 0].max():.3f} m, {added[..., 1].max():.3f} rad to odometry."
     )
     figure, axes = panel_grid("Path integration drift against noise of odometry", line, 2, 2)
-    speed = [0, *range(1, 1 + len(SPEED))]
-    heading = [0, *range(1 + len(SPEED), len(LEVELS))]
+    noise, exact_heading = np.array(list(LEVELS.values())), 1 + len(SPEED)
     columns = (
-        (speed, [each.speed for each in LEVELS], "noise of the speed (sqrt(s))"),
-        (heading, [each.heading for each in LEVELS], "noise of the heading (rad / sqrt(s))"),
+        ("heading exact", [*range(exact_heading)], "noise of the speed (sqrt(s))"),
+        ("speed exact", [0, *range(exact_heading, len(LEVELS))], "noise of the heading (rad / sqrt(s))"),
     )
-    for column, (rows, levels, across) in enumerate(columns):
+    for column, (title, rows, across) in enumerate(columns):
+        levels = noise[rows, column].tolist()
         for quantity, up in enumerate(("error of position (m)", "error of heading (rad)")):
             panel = axes[quantity][column]
-            _draw_curves(panel, result, rows, [levels[k] for k in rows], quantity)
-            style.name_axes(panel, across, up)
-    head_panel(axes[0][0], "heading exact")
-    head_panel(axes[0][1], "speed exact")
+            packet, odometry = (rms(each)[rows, :, quantity] for each in (packets, odometries))
+            for j, time in enumerate(times):
+                colour = COLOURS[j % len(COLOURS)]
+                panel.plot(levels, packet[:, j], "-", color=colour, lw=1.6, label=f"packet after {time} s")
+                panel.plot(levels, odometry[:, j], "--", color=style.INK, lw=0.9, zorder=3)
+                spread_dots(panel, levels, packets[:, rows, j, quantity].T.tolist(), colour)
+            panel.plot([], [], "--", color=style.INK, lw=0.9, label="odometry (control)")
+            panel.set_ylim(0, max(panel.get_ylim()[1], LEAST))
+            name_panel(panel, "" if quantity else title, across, up)
     style.add_legend(figure, axes[0][0], columns=6)
     figure.savefig(png)
-
-
-def _draw_curves(
-    axes: style.Axes, result: _DriftResult, rows: Sequence[int], levels: Sequence[float], quantity: int
-) -> None:
-    packet, odometry = rms(result.packet)[rows, :, quantity], rms(result.odometry)[rows, :, quantity]
-    for j, time in enumerate(result.times):
-        colour = COLOURS[j % len(COLOURS)]
-        axes.plot(levels, packet[:, j], "-", color=colour, lw=1.6, label=f"packet after {time} s")
-        axes.plot(levels, odometry[:, j], "--", color=style.INK, lw=0.9, zorder=3)
-        spread_dots(axes, levels, result.packet[:, rows, j, quantity].T.tolist(), colour)
-    axes.plot([], [], "--", color=style.INK, lw=0.9, label="odometry (control)")
-    axes.set_ylim(0, max(axes.get_ylim()[1], LEAST))
 
 
 def _errors_of(seed: int, times: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -190,7 +160,7 @@ def _packets(study: StudyCourse) -> np.ndarray:
     """[L, T, 3] packets in cells, followed round the torus."""
     count, ring = len(LEVELS), rings(study.config, np.dtype(float))
     network = study.config.excite_sigma, study.config.inhibit_sigma, study.config.global_inhibition, 1.0
-    speed, heading = np.array(LEVELS).T
+    speed, heading = np.array(list(LEVELS.values())).T
     # `CellSets` scales the noise of a step; over a step the white noise of a second is larger.
     sets = CellSets(Network(*(np.full(count, each) for each in network)), speed * np.sqrt(RATE), heading)
     tracks = walk(study.config, sets, study.course, study.chosen)
@@ -204,9 +174,9 @@ def _odometry(study: StudyCourse) -> np.ndarray:
     """[L, T, 3] poses in cells of the noisy odometry integrated without a network."""
     motion, noise = study.course.motion, study.course.noise
     poses = []
-    for level in LEVELS:
-        faster = 1 + level.speed * np.sqrt(RATE) * noise[:, :1]
-        turn = motion[:, 2] + level.heading * noise[:, 1]
+    for speed, heading in LEVELS.values():
+        faster = 1 + speed * np.sqrt(RATE) * noise[:, :1]
+        turn = motion[:, 2] + heading * noise[:, 1]
         poses.append(expected_poses(study.config, integrate(np.column_stack([motion[:, :2] * faster, turn]))))
     return np.array(poses)
 
@@ -231,36 +201,23 @@ ANCHORING_COLOURS = {"light": style.BLUE, "dark": style.INK, "shuffled": style.V
 ANCHORING_COLUMNS = ("path", "test", "error in the test", "error after it", "anchored again", "after s")
 
 
-class Schedule(NamedTuple):
-    """Times, s: the test begins; the light returns; the session ends."""
-
-    test: float = 120.0
-    back: float = 180.0
-    end: float = 240.0
-
-
-class _AnchoringResult(NamedTuple):
-    """Errors of n seeds over T steps.
-
-    Attributes:
-        schedule: of the sessions. error: by path and test [n, T, 2] distance (m) and angle (rad) of the
-            packet from the true pose. again: by path and test [n] time from the return of the light until
-            the packet is anchored again, s; inf: not by the end.
-    """
-
-    schedule: Schedule
-    error: Mapping[tuple[str, str], np.ndarray]
-    again: Mapping[tuple[str, str], np.ndarray]
-
-    def median(self, path: str, test: str, first: float, last: float) -> np.ndarray:
-        """[2] median of the errors (m, rad) of all seeds between two times, s."""
-        rows = slice(round(first * RATE), round(last * RATE))
-        return np.median(self.error[path, test][:, rows].reshape(-1, 2), axis=0)
+SCHEDULE = (120.0, 180.0, 240.0)
+"""Times, s: the test begins; the light returns; the session ends."""
+_Schedule = tuple[float, float, float]
+_Errors = Mapping[tuple[str, str], np.ndarray]
+"""By path and test."""
+_Anchoring = tuple[_Schedule, _Errors, _Errors]
+"""Of n seeds over T steps: [n, T, 2] distance (m) and angle (rad) of the packet from the true pose; [n] time
+from the return of the light until the packet is anchored again, s; inf: not by the end."""
 
 
-def measure_anchoring(task: Task, schedule: Schedule | None = None) -> _AnchoringResult:
+def _median_error(errors: np.ndarray, first: float, last: float) -> np.ndarray:
+    """[2] median (m, rad) over all seeds of errors [n, T, 2] between two times, s."""
+    return np.median(errors[:, round(first * RATE) : round(last * RATE)].reshape(-1, 2), axis=0)
+
+
+def measure_anchoring(task: Task, schedule: _Schedule = SCHEDULE) -> _Anchoring:
     """The errors of all paths, tests and seeds."""
-    schedule = schedule or Schedule()
     sessions = RatSessions(
         rat_config(f"rat_simulation.rate_hz={RATE}", "rat_simulation.views.every=1", "session.reserve=256")
     )
@@ -274,59 +231,55 @@ def measure_anchoring(task: Task, schedule: Schedule | None = None) -> _Anchorin
         for test in TESTS:
             error[path, test] = np.array([error_size(torus_error(each[test])) for each in runs])
             again[path, test] = np.array(
-                [_anchored_after(each[test], each["light"], schedule) for each in runs]
+                [_anchored_after(each[test], each["light"], schedule[1]) for each in runs]
             )
-    return _AnchoringResult(schedule, error, again)
+    return schedule, error, again
 
 
-def _anchored_after(run: CellRecording, light: CellRecording, schedule: Schedule) -> float:
+def _anchored_after(run: CellRecording, light: CellRecording, back: float) -> float:
     """Time from the return of the light until the packet is and stays near to that of the session of the same
     seed in light throughout, s; inf if it does not."""
     apart = run.packet_pose - light.packet_pose
-    far = np.any(error_size(shortest(run, apart)) > NEAR, axis=1)[round(schedule.back * RATE) :]
+    far = np.any(error_size(shortest(run, apart)) > NEAR, axis=1)[round(back * RATE) :]
     held = round(HELD * RATE)
     windows = np.lib.stride_tricks.sliding_window_view(far, held)
     near = np.flatnonzero(~windows.any(axis=1))
     return float(near[0]) / RATE if len(near) else np.inf
 
 
-def _table_anchoring(result: _AnchoringResult) -> list[str]:
+def _table_anchoring(result: _Anchoring) -> list[str]:
     """The lines of the table, and what it does not show."""
-    _, back, end = result.schedule
-    seeds = len(next(iter(result.error.values())))
-    lines = [
+    (begins, back, end), errors, times = result
+    seeds = len(next(iter(errors.values())))
+    above = [
         f"{seeds} seeds a path; medians over seeds and time. Goal: error in light far below that in darkness;"
         " control: shuffled views do not anchor.",
         f"Anchored again: seeds whose packet comes within {NEAR[0]:g} m and {NEAR[1]:.2f} rad of the packet"
         f" in light throughout, and stays for {HELD:g} s; their median time after the light returned.",
-        "",
-        *markdown_header(ANCHORING_COLUMNS).splitlines(),
     ]
-    for (path, test), again in result.again.items():
-        during = result.median(path, test, result.schedule.test, back)
-        after = result.median(path, test, (back + end) / 2, end)
+    rows = []
+    for (path, test), error in errors.items():
+        parts = _median_error(error, begins, back), _median_error(error, (back + end) / 2, end)
+        again = times[path, test]
         done = again[np.isfinite(again)]
+        last = [f"{len(done)} of {seeds}", f"{np.median(done):.1f}" if len(done) else "-"]
         which = f"{test} (control)" if test == "shuffled" else test
-        cells = [path, which, *(f"{m:.3f} m, {rad:.3f} rad" for m, rad in (during, after))]
-        if test == "light":
-            cells += ["-", "-"]
-        else:
-            cells += [f"{len(done)} of {seeds}", f"{np.median(done):.1f}" if len(done) else "-"]
-        lines.append(markdown_row(cells))
-    return [*lines, "", ANCHORING_NOT_SHOWN]
+        medians = (f"{m:.3f} m, {rad:.3f} rad" for m, rad in parts)
+        rows.append([path, which, *medians, *(["-", "-"] if test == "light" else last)])
+    below = (
+        "Not shown: the corrected map. RatSLAM as published stores a view with the packet of that time, so"
+        " the error in light contains the drift during learning; the experience map corrects it, pose cells"
+        " do not."
+    )
+    return table_lines(above, ANCHORING_COLUMNS, rows, [below])
 
 
-ANCHORING_NOT_SHOWN = (
-    "Not shown: the corrected map. RatSLAM as published stores a view with the packet of that time, so the"
-    " error in light contains the drift during learning; the experience map corrects it, pose cells do not."
-)
-
-
-def _draw_anchoring(result: _AnchoringResult, png: Path) -> None:
+def _draw_anchoring(result: _Anchoring, png: Path) -> None:
     """Median errors over time, with the range of the middle half of the seeds."""
-    begins, back, end = result.schedule
+    (begins, back, end), errors, _ = result
     during = {
-        test: np.mean([result.median(path, test, begins, back) for path in PATHS], axis=0) for test in TESTS
+        test: np.mean([_median_error(errors[path, test], begins, back) for path in PATHS], axis=0)
+        for test in TESTS
     }
     line = "Median error in the test: " + ", ".join(
         f"{test} {m:.2f} m, {rad:.2f} rad" for test, (m, rad) in during.items()
@@ -336,7 +289,7 @@ def _draw_anchoring(result: _AnchoringResult, png: Path) -> None:
         for quantity, up in enumerate(("error of position (m)", "error of heading (rad)")):
             panel = axes[quantity][column]
             for test in TESTS:
-                _draw_curve(panel, result.error[path, test][..., quantity], test)
+                _draw_curve(panel, errors[path, test][..., quantity], test)
             panel.axvspan(begins, back, color=style.LINE_GREY, lw=0, zorder=0.5)
             panel.text(
                 (begins + back) / 2, 1.0, "test", transform=panel.get_xaxis_transform(), ha="center",
@@ -344,8 +297,8 @@ def _draw_anchoring(result: _AnchoringResult, png: Path) -> None:
             )  # fmt: skip
             panel.set_xlim(0, end)
             panel.set_ylim(bottom=0)
-            style.name_axes(panel, "time (s)", up)
-        head_panel(axes[0][column], "path of a real rat" if path == "sargolini" else "random walk")
+            title = "path of a real rat" if path == "sargolini" else "random walk"
+            name_panel(panel, "" if quantity else title, "time (s)", up)
     style.add_legend(figure, axes[0][0])
     figure.savefig(png)
 
@@ -362,21 +315,22 @@ def _draw_curve(axes: style.Axes, error: np.ndarray, test: str) -> None:
     axes.plot(time, middle, color=ANCHORING_COLOURS[test], lw=1.6, label=f"{test} in the test")
 
 
-def _run(sessions: RatSessions, schedule: Schedule, path: str, test: str, seed: int) -> CellRecording:
-    changed: dict[str, Any] = {"seconds": schedule.end}
+def _run(sessions: RatSessions, schedule: _Schedule, path: str, test: str, seed: int) -> CellRecording:
+    begins, back, end = schedule
+    changed: dict[str, Any] = {"seconds": end}
     if path == "walk":
         changed["walk"] = {}
     else:
         # Each seed has another slice of the recorded path, which lasts 600 s.
-        start = float(stream(seed, "cells.slice").uniform(0.0, 600.0 - schedule.end - 1.0))
+        start = float(stream(seed, "cells.slice").uniform(0.0, 600.0 - end - 1.0))
         changed["path"] = {"file": path, "heading_smoothing": 0.25, "skip": start}
     if test == "dark":
-        changed["phases"] = [{"start": schedule.test, "end": schedule.back, "dark": True}]
+        changed["phases"] = [{"start": begins, "end": back, "dark": True}]
     source = rat_source(sessions.config, seed, **changed)
     if test != "shuffled":
         return sessions.run(source)
     log = load_into_memory(source)
-    rows = np.flatnonzero(log.seen & (log.time >= schedule.test) & (log.time < schedule.back))
+    rows = np.flatnonzero(log.seen & (log.time >= begins) & (log.time < back))
     views = log.views.copy()
     views[rows] = log.views[stream(seed, "cells.shuffled_views").permutation(rows)]
     return sessions.run(replace(log, views=views))

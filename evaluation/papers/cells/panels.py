@@ -1,23 +1,21 @@
 """One figure or table of pose cells, and what its modules share.
 
 The error of the packet on the torus: decoded minus true pose, the shortest way round. Panels in rows and
-columns under a title, in the style of all plots. Processor and wall time of calls on one core, and the load
-of the machine meanwhile.
+columns under a title, in the style of all plots. Processor and wall time of calls.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from time import perf_counter, process_time
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from evaluation.cells.decoding import truth_in_sheet
 from evaluation.cells.recording import CellRecording
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
-from evaluation.studies.machine import one_core, processor_name, watch_load
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,6 +37,14 @@ def shortest(recording: CellRecording, difference: np.ndarray) -> np.ndarray:
 def error_size(error: np.ndarray) -> np.ndarray:
     """[..., 2] distance (m) and angle (rad, not negative) of errors [..., 3]."""
     return np.stack([np.hypot(error[..., 0], error[..., 1]), np.abs(error[..., 2])], axis=-1)
+
+
+def table_lines(
+    above: Sequence[str], columns: Sequence[str], rows: Iterable[Iterable[object]], below: Sequence[str] = ()
+) -> list[str]:
+    """The lines of a table, with sentences above and below it."""
+    head = [*above, "", *markdown_header(columns).splitlines(), *map(markdown_row, rows)]
+    return [*head, "", *below] if below else head
 
 
 TOP, BOTTOM = 1.15, 0.85
@@ -77,9 +83,10 @@ def panel_grid(
     return figure, axes
 
 
-def head_panel(axes: Axes, title: str) -> None:
-    """Puts a title above a panel."""
+def name_panel(axes: Axes, title: str, across: str, up: str) -> None:
+    """Puts a title above a panel, and names its axes, with units."""
     axes.set_title(title, fontsize=9.5, color=style.INK, loc="left")
+    style.name_axes(axes, across, up)
 
 
 def spread_dots(axes: Axes, at: Sequence[float], values: Sequence[Sequence[float]], colour: str) -> None:
@@ -88,26 +95,8 @@ def spread_dots(axes: Axes, at: Sequence[float], values: Sequence[Sequence[float
         axes.plot([x] * len(group), group, "o", ms=3.5, mew=0, color=colour, alpha=0.5)
 
 
-class Taken(NamedTuple):
-    """Time of a call, s: of all threads of this process on processors, and on the wall."""
-
-    processor: float
-    wall: float
-
-
-def time_call(call: Callable[[], object]) -> Taken:
-    """The time of a call."""
+def time_call(call: Callable[[], object]) -> tuple[float, float]:
+    """The time of a call, s: of all threads of this process on processors, and on the wall."""
     wall, processor = perf_counter(), process_time()
     call()
-    return Taken(process_time() - processor, perf_counter() - wall)
-
-
-@contextmanager
-def on_one_core() -> Iterator[list[str]]:
-    """Keeps the process on its idlest core; after the block the list has one sentence on machine and load."""
-    found, load = list[str](), watch_load()
-    with one_core():
-        yield found
-    others = load()
-    busy = "unknown" if others is None else f"{others:.1f} cores busy with other processes in the mean"
-    found.append(f"On one core of {processor_name()}; load of the machine: {busy}.")
+    return process_time() - processor, perf_counter() - wall

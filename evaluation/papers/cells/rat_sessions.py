@@ -8,12 +8,14 @@ import numpy as np
 
 from evaluation.cells.recording import CellRecording
 from ratslam.core.session import Session
+from ratslam.network.config import PoseCellConfig
 from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.cell_recorder import CellSums, plan_recording
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError
+from tactile.base.random_streams import stream
 
 PACKAGED = "rat_box"
 """The packaged configuration that the sessions begin with: a box of 1 m, RatSLAM as published."""
@@ -89,23 +91,40 @@ SECONDS = 599.0
 
 
 def record_rat(
-    way: Way, chosen: int, sums: bool = False, seconds: float = SECONDS, seed: int = 0
+    way: Way, cells: int, sums: bool = False, seconds: float = SECONDS, seed: int = 0
 ) -> CellRecording:
     """The pose cells of a session at 20 Hz with views at 10 Hz and errors of the odometry.
 
     Args:
-        chosen: cells, drawn from the whole network. sums: whether all cells are summed at 10 Hz. seed: of the
-            cells, the errors and the random walk.
+        cells: the first so many that were ever active, of twice as many drawn from the whole network. sums:
+            whether all cells are summed at 10 Hz. seed: of the cells, the errors and the random walk.
     """
     own = [f"rat_simulation.seconds={seconds}", f"rat_simulation.seed={seed}", f"session.seed={seed}"]
-    own += [f"cells.chosen={chosen}", "session.reserve=1024"]
+    own += [f"cells.chosen={2 * cells}", "session.reserve=1024"]
     own += ["cells.sums={}"] if sums else []
     own += ["rat_simulation.walk={}"] if way == "random walk" else []
     with open_observations(load_config(PACKAGED, own)) as (config, source):
-        return RatSessions(config).run(source)
-
-
-def with_active_cells(recording: CellRecording, cells: int) -> CellRecording:
-    """The recording with the first so many chosen cells that were ever active."""
+        recording = RatSessions(config).run(source)
     kept = np.flatnonzero(recording.activity.any(axis=0))[:cells]
     return recording._replace(cell=recording.cell[kept], activity=recording.activity[:, kept])
+
+
+EVERY = 3
+"""Every third heading of a column is recorded: the packet is wider than the gap."""
+
+
+def choose_columns(config: PoseCellConfig, count: int, seed: int) -> list[list[int]]:
+    """Indices [x, y, heading] of the cells of `count` columns, drawn without repeats; a setting
+    `cells.chosen`. A column is the cells of one place on the torus."""
+    side = config.cells_xy
+    drawn = stream(seed, "cells.columns").permutation(side * side)[:count].tolist()
+    headings = range(0, config.cells_heading, EVERY)
+    return [[at % side, at // side, heading] for at in drawn for heading in headings]
+
+
+def column_activity(activity: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Activity [T, columns] of columns, from that of their cells [T, C]: sums over a column, and that of one
+    cell of each, at a heading that differs from column to column."""
+    split = activity.reshape(len(activity), columns, -1)
+    at = np.arange(columns)
+    return split.sum(axis=2), split[:, at, at % split.shape[2]]

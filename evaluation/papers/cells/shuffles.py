@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -28,9 +28,9 @@ from evaluation.cells.rate_map import (
 )
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import Calibration, PathBins, Score, calibrate, shuffled_scores
-from evaluation.papers.cells.rat_sessions import SECONDS, Way, record_rat, with_active_cells
+from evaluation.papers.cells.panels import table_lines
+from evaluation.papers.cells.rat_sessions import SECONDS, Way, record_rat
 from evaluation.papers.figure import Figure, Task
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.studies.executor import run_tasks
 
 CELLS, TRUE_CELLS, SHUFFLES = 500, 100, 100
@@ -41,20 +41,14 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class _ShuffledRow(NamedTuple):
-    """One score on one path. true_share: of the true cells above the percentile of their shuffles.
-    true_mean: their mean score."""
-
-    way: Way
-    score: str
-    calibration: Calibration
-    true_share: float
-    true_mean: float
+_Row = tuple[Way, str, Calibration, float, float]
+"""One score on one path: of the true cells the share above the percentile of their shuffles, and the mean
+score."""
 
 
 def check_shuffles(
     task: Task, cells: int = CELLS, shuffles: int = SHUFFLES, seconds: float = SECONDS
-) -> tuple[str, list[_ShuffledRow]]:
+) -> tuple[str, list[_Row]]:
     """Compares cells of a session with their shuffles, for every score and path; what is compared, as
     sentences, and the rows.
 
@@ -66,7 +60,7 @@ def check_shuffles(
     true_cells = min(cells, TRUE_CELLS)
     tasks = []
     for way in get_args(Way):
-        recording = with_active_cells(record_rat(way, 2 * cells, seconds=seconds, seed=task.first), cells)
+        recording = record_rat(way, cells, seconds=seconds, seed=task.first)
         tasks += [(recording, way, kind, score) for kind, scores in SCORES.items() for score in scores]
     compare = partial(_compare, true_cells=true_cells, shuffles=shuffles, seed=task.first)
     rows = list(run_tasks(compare, tasks, task.workers))
@@ -75,43 +69,38 @@ def check_shuffles(
         "of each cell, with rates in units of activity. Goal: the share of shuffled cells above the "
         "95th percentile of their own shuffles lies in the binomial 95 % band round 5 %. Of 26 "
         "shares, one or two are outside by chance. Tied: share at the percentile, which is not above "
-        f"it. Control: of the first {true_cells} cells as recorded, the share above theirs.\n"
+        f"it. Control: of the first {true_cells} cells as recorded, the share above theirs."
     )
     return note, rows
 
 
-def _compare(
-    task: tuple[CellRecording, Way, str, str], true_cells: int, shuffles: int, seed: int
-) -> _ShuffledRow:
+def _compare(task: tuple[CellRecording, Way, str, str], true_cells: int, shuffles: int, seed: int) -> _Row:
     recording, way, kind, name = task
     bins, score = path_bins(recording, kind), SCORES[kind][name]
     checked = calibrate(recording.activity, bins, score, shuffles, seed)
     true = shuffled_scores(recording.activity[:, :true_cells], bins, score, shuffles, seed)
     known = np.isfinite(true.score) & np.isfinite(true.percentile)
     share, mean = (float(each[known].mean()) if known.any() else np.nan for each in (true.above, true.score))
-    return _ShuffledRow(way, name, checked, share, mean)
+    return way, name, checked, share, mean
 
 
-def _shuffle_table(result: tuple[str, list[_ShuffledRow]]) -> Iterator[str]:
+def _shuffle_table(result: tuple[str, list[_Row]]) -> list[str]:
     """The lines of the table."""
-    note, rows = result
-    yield note
-    yield markdown_header(COLUMNS)
-    for row in rows:
-        found = row.calibration
+    note, found = result
+    rows = []
+    for way, score, cells, true_share, true_mean in found:
         share, low, high, tied, true = (
-            f"{100 * each:.1f} %" for each in (found.share, found.low, found.high, found.tied, row.true_share)
+            f"{100 * each:.1f} %" for each in (cells.share, cells.low, cells.high, cells.tied, true_share)
         )
-        within = "yes" if found.low <= found.share <= found.high else "**no**"
-        yield markdown_row(
-            [
-                row.way, row.score, found.cells, share, f"{low} - {high}", within, tied,
-                f"{found.shuffled_mean:.3g}", true, f"{row.true_mean:.3g}",
-            ]
-        )  # fmt: skip
+        within = "yes" if cells.low <= cells.share <= cells.high else "**no**"
+        means = f"{cells.shuffled_mean:.3g}", f"{true_mean:.3g}"
+        rows.append(
+            [way, score, cells.cells, share, f"{low} - {high}", within, tied, means[0], true, means[1]]
+        )
+    return table_lines([note], COLUMNS, rows)
 
 
-FIGURE = Figure("Shuffled controls", check_shuffles, lambda result: list(_shuffle_table(result)), None)
+FIGURE = Figure("Shuffled controls", check_shuffles, _shuffle_table, None)
 
 
 SMOOTHING = 1.5
@@ -135,22 +124,17 @@ PLACE_SCORES: Mapping[str, Score] = {
     "square score": _smoothed(lambda rates, seconds: lattice_scores(autocorrelogram(rates), SQUARE)),
 }
 """Scores of maps of 20 x 20 bins."""
-HEADING_SCORES: Mapping[str, Score] = {
-    "mean vector length": mean_vector_length,
-    "Rayleigh z": rayleigh_z,
-    "heading information": information,
-}
-"""Scores of tuning curves of 36 bins, not smoothed."""
-JOINT_SCORES: Mapping[str, Score] = {"conjunctive information": conjunctive_information}
-"""Scores of maps of 8 headings and 10 x 10 bins, not smoothed."""
-
-
 SCORES: Mapping[str, Mapping[str, Score]] = {
     "place": PLACE_SCORES,
-    "heading": HEADING_SCORES,
-    "joint": JOINT_SCORES,
+    "heading": {
+        "mean vector length": mean_vector_length,
+        "Rayleigh z": rayleigh_z,
+        "heading information": information,
+    },
+    "joint": {"conjunctive information": conjunctive_information},
 }
-"""The scores of each kind of bins."""
+"""The scores of each kind of bins: tuning curves of 36, and maps of 8 headings and 10 x 10, are not
+smoothed."""
 
 
 def path_bins(recording: CellRecording, kind: str) -> PathBins:

@@ -27,10 +27,15 @@ from evaluation.cells.grid_score import (
 from evaluation.cells.rate_map import place_index, sample_seconds, smooth_rates
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import PathBins, ShuffledScores, shuffled_scores
-from evaluation.papers.cells.boxes import choose_columns, one_of_each, sum_columns
-from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
+from evaluation.papers.cells.panels import table_lines
+from evaluation.papers.cells.rat_sessions import (
+    RatSessions,
+    choose_columns,
+    column_activity,
+    rat_config,
+    rat_source,
+)
 from evaluation.papers.figure import Figure, Task
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
 
@@ -99,10 +104,11 @@ def measure_torus(
     ]  # fmt: skip
     measure = partial(measure_cells, shuffles=shuffles, seed=task.first)
     large, small = recordings
+    summed, single = column_activity(large.activity, columns)
     return (
-        measure(large, sum_columns(large.activity, columns), LARGE, BINS[0]),
-        measure(large, one_of_each(large.activity, columns), LARGE, BINS[0]),
-        measure(small, sum_columns(small.activity, columns), SMALL, BINS[1]),
+        measure(large, summed, LARGE, BINS[0]),
+        measure(large, single, LARGE, BINS[0]),
+        measure(small, column_activity(small.activity, columns)[0], SMALL, BINS[1]),
         network.cells_xy * network.cell_size,
     )
 
@@ -145,39 +151,32 @@ def measure_cells(
 def _table_torus(result: _Torus) -> list[str]:
     """The lines of the table, and what it does not show."""
     large, single, small, torus = result
-    lines = [
+    above = (
         f"{len(large.maps)} columns. Medians over cells, in brackets the 2.5th and 97.5th percentile; "
-        "control: median of the 95th percentile of each cell's shuffles, and the share above theirs.",
-        "",
-        *markdown_header(("figure", "expectation", "measured", "control")).splitlines(),
-    ]
-    lines.append(markdown_row(["larger box over torus", "above 1", _ratio(large, torus), "-"]))
+        "control: median of the 95th percentile of each cell's shuffles, and the share above theirs."
+    )
+    rows = [["larger box over torus", "above 1", _ratio(large, torus), "-"]]
     for name, found in (("columns", large), ("single cells", single)):
-        spacing = markdown_row([
-            f"{name}: spacing m", f"side of the torus, {torus:.2f}", _spread(found.spacing, 3),
-            f"shuffles have none; found in {np.isfinite(found.spacing).sum()} of {len(found.maps)}",
-        ])  # fmt: skip
-        square, hexagonal = _control(found.square), _control(found.hexagonal)
-        lines += [
-            spacing,
-            markdown_row([f"{name}: square score", "above control", _spread(found.square.score), square]),
-            markdown_row([f"{name}: grid score", "no grid cell", _spread(found.hexagonal.score), hexagonal]),
+        known = f"shuffles have none; found in {np.isfinite(found.spacing).sum()} of {len(found.maps)}"
+        square, hexagonal = found.square, found.hexagonal
+        rows += [
+            [f"{name}: spacing m", f"side of the torus, {torus:.2f}", _spread(found.spacing, 3), known],
+            [f"{name}: square score", "above control", _spread(square.score), _control(square)],
+            [f"{name}: grid score", "no grid cell", _spread(hexagonal.score), _control(hexagonal)],
         ]
-    lines += [
-        markdown_row(["columns: fields", "several", _counts(large.fields), "-"]),
-        markdown_row(["smaller box over torus", "below 1", _ratio(small, torus), "-"]),
-        markdown_row(["columns: fields", "one or none", _counts(small.fields), "-"]),
+    rows += [
+        ["columns: fields", "several", _counts(large.fields), "-"],
+        ["smaller box over torus", "below 1", _ratio(small, torus), "-"],
+        ["columns: fields", "one or none", _counts(small.fields), "-"],
     ]
     for name, scores in (("square", small.square), ("grid", small.hexagonal)):
         text = f"columns in the smaller box: {name} score"
-        lines.append(markdown_row([text, "no lattice", _spread(scores.score), _control(scores)]))
-    return [*lines, "", NOT_SHOWN]
-
-
-NOT_SHOWN = (
-    "Not shown: entorhinal grid cells, whose lattice is hexagonal, with several spacings; this torus is "
-    "rigid and square, its activity a rate without spikes and theta, and its path integration here exact."
-)
+        rows.append([text, "no lattice", _spread(scores.score), _control(scores)])
+    below = (
+        "Not shown: entorhinal grid cells, whose lattice is hexagonal, with several spacings; this torus is "
+        "rigid and square, its activity a rate without spikes and theta, and its path integration here exact."
+    )
+    return table_lines([above], ("figure", "expectation", "measured", "control"), rows, [below])
 
 
 def _draw_torus(result: _Torus, png: Path) -> None:

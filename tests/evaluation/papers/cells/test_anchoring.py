@@ -8,42 +8,36 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.papers.cells.packet_figures import (
-    ANCHORING,
-    PATHS,
-    RATE,
-    TESTS,
-    Schedule,
-    measure_anchoring,
-)
+from evaluation.papers.cells.packet_figures import ANCHORING, PATHS, RATE, TESTS, measure_anchoring
 from evaluation.papers.figure import Task
 
-SHORT = Schedule(test=20.0, back=28.0, end=34.0)
+TEST, BACK, END = 20.0, 28.0, 34.0
 
 
 @pytest.fixture(scope="module")
 def result() -> Any:
-    return measure_anchoring(Task(41000, sessions=1), SHORT)
+    return measure_anchoring(Task(41000, sessions=1), (TEST, BACK, END))
 
 
 def test_sessions_are_equal_until_the_test(result: Any) -> None:
-    rows = round(SHORT.test * RATE)
+    rows, (_, error, _) = round(TEST * RATE), result
     for path in PATHS:
-        light, *others = (result.error[path, test] for test in TESTS)
+        light, *others = (error[path, test] for test in TESTS)
         for other in others:
             assert np.array_equal(other[:, :rows], light[:, :rows])
             assert not np.array_equal(other, light)
 
 
 def test_a_packet_in_light_throughout_is_anchored(result: Any) -> None:
-    assert all((result.again[path, "light"] == 0).all() for path in PATHS)
-    assert all((times >= 0).all() for times in result.again.values())
+    _, _, again = result
+    assert all((again[path, "light"] == 0).all() for path in PATHS)
+    assert all((times >= 0).all() for times in again.values())
 
 
 def test_shuffled_views_mislead(result: Any) -> None:
     """On the path of the rat; on the walk no view is recalled within these 8 s."""
-    rows = slice(round(SHORT.test * RATE), round(SHORT.back * RATE))
-    light, _, shuffled = (result.error["sargolini", test][:, rows].mean(axis=(0, 1)) for test in TESTS)
+    rows, (_, error, _) = slice(round(TEST * RATE), round(BACK * RATE)), result
+    light, _, shuffled = (error["sargolini", test][:, rows].mean(axis=(0, 1)) for test in TESTS)
     assert (shuffled > 1.5 * light).all(), (light, shuffled)
 
 

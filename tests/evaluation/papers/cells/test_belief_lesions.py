@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 
 from evaluation.papers.cells.belief_lesions import (
+    CELL,
     INTACT,
     LESIONS,
-    beside_intact,
     foreign_activity,
     measure_lesions,
     measure_sizes,
     replaced,
-    same_closures,
-    silent_cells,
 )
 from evaluation.papers.figure import CELLS, Task, find_figure
 from evaluation.papers.tables import touch_table as touch
@@ -40,18 +38,17 @@ def result() -> Any:
 
 
 def test_the_intact_network_closes_loops_and_a_renamed_one_the_same(result: Any) -> None:
-    ((intact, _),) = beside_intact(result, INTACT, "short")
-    ((renamed, beside),) = beside_intact(result, "cells and ties permuted together", "short")
-    assert intact.true > 0
-    assert beside is intact
-    assert same_closures(renamed, intact) == 1
+    ((_, _, true),) = result[INTACT, "short"]
+    ((_, same, _),) = result["cells and ties permuted together", "short"]
+    assert true > 0
+    assert same == 1
 
 
 @pytest.mark.parametrize("lesion", ["ties permuted alone", "prediction constant"])
 def test_a_network_that_knows_no_places_closes_nothing(result: Any, lesion: str) -> None:
-    ((lesioned, intact),) = beside_intact(result, lesion, "short")
-    assert len(lesioned.closures) == 0
-    assert same_closures(lesioned, intact) == 0
+    ((figures, same, _),) = result[lesion, "short"]
+    assert figures.metrics.closures == 0
+    assert same == 0
 
 
 def test_table_and_picture(result: Any, tmp_path: Path) -> None:
@@ -72,15 +69,14 @@ def sizes() -> Any:
 
 @pytest.mark.soak
 def test_the_usual_size_is_the_product_and_a_tiny_network_closes_less(sizes: Any, result: Any) -> None:
-    closed = {(task.side, task.grows): one.figures for task, one in sizes.items()}
-    ((intact, _),) = beside_intact(result, INTACT, "short")
-    assert intact.figures is not None
-    assert closed[21, True].metrics == intact.figures.metrics
-    assert closed[7, False].metrics.closures < closed[21, True].metrics.closures
-    assert {task.side: one.sides for task, one in sizes.items() if not task.grows} == {
-        7: (7, 7),
-        21: (21, 21),
-    }
+    ((intact, _, _),) = result[INTACT, "short"]
+    (fixed, tiny_sides, _), (_, usual_sides, _), (grown, _, _) = (
+        sizes[network][0] for network in ((7, CELL, False), (21, CELL, False), (21, CELL, True))
+    )
+    assert intact is not None
+    assert grown.metrics == intact.metrics
+    assert fixed.metrics.closures < grown.metrics.closures
+    assert (tiny_sides, usual_sides) == ((7, 7), (21, 21))
 
 
 @pytest.mark.soak
@@ -110,7 +106,7 @@ def test_silent_cells_hold_nothing_and_the_rest_what_it_held() -> None:
     cells, mass = driven(30)
     belief = pose_cells.start(NETWORK, mass.shape)
     intact = pose_cells.anchor(NETWORK, belief, cells, mass).activity
-    with replaced(silent_cells(0.3, 5)):
+    with replaced(LESIONS["30% silent"](5)):
         left = pose_cells.anchor(NETWORK, belief, cells, mass).activity
     assert ((left == 0) | (left == intact)).all()
     assert 0.5 < float(left.sum()) < 0.9
