@@ -227,14 +227,13 @@ def _figures(arguments: argparse.Namespace) -> int:
 
 def _maps(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
-    from evaluation.papers.maps.operations import PRODUCT, reproduce_maps
+    from evaluation.papers.maps.operations import Methods, reproduce_maps
     from evaluation.papers.tables.markdown import select_rows
 
     names = select_rows(arguments.rows, MAPS, tuple(MAPS))
     lines = reproduce_maps(
-        MAPS,
         names,
-        PRODUCT,
+        Methods(),
         arguments.output,
         arguments.first,
         arguments.sessions,

@@ -78,7 +78,6 @@ def compare_scores(task: Task, seconds: float = SECONDS) -> list[tuple[str, str,
 
 
 def _agreement_table(result: list[tuple[str, str, int, float, float]]) -> list[str]:
-    """The lines of the table."""
     note = (
         "Recorded pose cells of a rat in 20 x 20 place and 36 heading bins, maps smoothed over 1.5 bins; "
         "each package gets the same maps, in its own convention (`evaluation/cells/README.md`)."

@@ -90,16 +90,20 @@ def _permuted_together(seed: int) -> Functions:
     return {"tie": tie_moved, "excite": excite_moved}
 
 
-def _permuted_cells(seed: int) -> Functions:
-    """After every view the activities of all cells change places; the ties stay."""
+def _after_views(change: Callable[[Array, ViewCells], Array]) -> Functions:
+    """After every view the activity [H, Y, X] is changed; the ties stay."""
     anchor = pose_cells.anchor
 
-    def anchor_moved(network: Network, belief: Belief, cells: ViewCells, mass: Array) -> Belief:
+    def anchor_changed(network: Network, belief: Belief, cells: ViewCells, mass: Array) -> Belief:
         belief = anchor(network, belief, cells, mass)
-        flat = belief.activity.reshape(-1)[_order(seed, belief.activity.shape)]
-        return belief._replace(activity=flat.reshape(belief.activity.shape))
+        return belief._replace(activity=change(belief.activity, cells))
 
-    return {"anchor": anchor_moved}
+    return {"anchor": anchor_changed}
+
+
+def _permuted_cells(seed: int) -> Functions:
+    """The activities of all cells change places after every view."""
+    return _after_views(lambda sheet, _: sheet.reshape(-1)[_order(seed, sheet.shape)].reshape(sheet.shape))
 
 
 def _permuted_ties(seed: int) -> Functions:
@@ -122,14 +126,12 @@ def _permuted_ties(seed: int) -> Functions:
 
 def _silent_cells(share: float, seed: int) -> Functions:
     """A random share of the cells never becomes active."""
-    anchor = pose_cells.anchor
 
-    def anchor_silent(network: Network, belief: Belief, cells: ViewCells, mass: Array) -> Belief:
-        belief = anchor(network, belief, cells, mass)
-        lively = stream(seed, "cells.silent").random(belief.activity.shape) >= share
-        return belief._replace(activity=belief.activity * lively.astype(np.float32))
+    def silence(sheet: Array, _: ViewCells) -> Array:
+        lively = stream(seed, "cells.silent").random(sheet.shape) >= share
+        return sheet * lively.astype(np.float32)
 
-    return {"anchor": anchor_silent}
+    return _after_views(silence)
 
 
 def foreign_activity(recorded: np.ndarray) -> Functions:
@@ -138,17 +140,13 @@ def foreign_activity(recorded: np.ndarray) -> Functions:
     Args:
         recorded: [n, H, Y, X] its activity, each after `EVERY` steps; repeated over a larger network.
     """
-    anchor = pose_cells.anchor
 
-    def anchor_foreign(network: Network, belief: Belief, cells: ViewCells, mass: Array) -> Belief:
-        belief = anchor(network, belief, cells, mass)
+    def exchange(sheet: Array, cells: ViewCells) -> Array:
         at = jnp.minimum(jnp.sum(cells.used[0]).astype(jnp.int32) // EVERY, len(recorded) - 1)
-        sheets = [
-            np.arange(n) % size for n, size in zip(belief.activity.shape, recorded.shape[1:], strict=True)
-        ]
-        return belief._replace(activity=jnp.asarray(recorded)[at][np.ix_(*sheets)])
+        rows = [np.arange(n) % size for n, size in zip(sheet.shape, recorded.shape[1:], strict=True)]
+        return jnp.asarray(recorded)[at][np.ix_(*rows)]
 
-    return {"anchor": anchor_foreign}
+    return _after_views(exchange)
 
 
 LESIONS: dict[str, Callable[[int], Functions]] = {
@@ -246,28 +244,15 @@ def _lesions_and_rows(result: _Lesions) -> tuple[list[str], list[str]]:
 
 
 def _table_lesions(result: _Lesions) -> list[str]:
-    """The lines of the table, and what it does not show."""
     lesions, names = _lesions_and_rows(result)
     rows = []
     for row, lesion in product(names, lesions):
         figures = [one for one, _, _ in result[lesion, row] if one is not None]
         same = [share for _, share, _ in result[lesion, row]]
         intel = result.get((lesion, ""))
-        closures, false = (
-            sum(getattr(one.metrics, name) for one in figures) for name in ("closures", "false_closures")
-        )
-        rows.append(
-            [
-                lesion,
-                row,
-                f"{np.nanmedian([one.revisits_closed for one in figures]):.2f}",
-                f"{closures}, {false}",
-                f"{np.nanmedian(same):.0%}" if np.isfinite(same).any() else "-",
-                f"{np.median([one.metrics.em for one in figures]):.3f}",
-                f"{np.median([one.metrics.arr for one in figures]):.3f}",
-                intel[0][2] if intel else "-",
-            ]
-        )
+        of_intact = f"{np.nanmedian(same):.0%}" if np.isfinite(same).any() else "-"
+        true = intel[0][2] if intel else "-"
+        rows.append([lesion, row, *_closed(figures), of_intact, *_errors(figures), true])
     mazes = len(result[INTACT, names[0]])
     goals = "; ".join(f"{lesion}: {goal}" for lesion, goal in GOALS.items() if lesion in lesions)
     above = f"Medians over {mazes} mazes a row, closures are sums. Goal: {goals}."
@@ -277,6 +262,19 @@ def _table_lesions(result: _Lesions) -> list[str]:
         " and `-` means that RATSLAM_DATA is not set."
     )
     return table_lines([above], COLUMNS, rows, [below])
+
+
+def _closed(sessions: Sequence[SessionFigures]) -> tuple[str, str]:
+    """Median share of revisits closed; sums of closures and of false ones."""
+    closures, false = (
+        sum(getattr(one.metrics, name) for one in sessions) for name in ("closures", "false_closures")
+    )
+    return f"{np.nanmedian([one.revisits_closed for one in sessions]):.2f}", f"{closures}, {false}"
+
+
+def _errors(sessions: Sequence[SessionFigures]) -> list[str]:
+    """Medians of EM and ARR."""
+    return [f"{np.median([getattr(one.metrics, name) for one in sessions]):.3f}" for name in ("em", "arr")]
 
 
 def _draw_lesions(result: _Lesions, png: Path) -> None:
@@ -391,7 +389,6 @@ def _update_time(session: Session) -> float:
 
 
 def _table_sizes(result: _Sizes) -> list[str]:
-    """The lines of the table, and what it does not show."""
     columns = (
         "cells a side", "cell, m", "grows", "cells at the end", "revisits closed", "closures, false", "EM",
         "ARR", "us per update",
@@ -399,23 +396,8 @@ def _table_sizes(result: _Sizes) -> list[str]:
     rows = []
     for (side, size, grows), sessions in result.items():
         figures, ends, updates = zip(*sessions, strict=True)
-        metrics = [one.metrics for one in figures]
-        closures, false = (
-            sum(getattr(one, name) for one in metrics) for name in ("closures", "false_closures")
-        )
-        rows.append(
-            [
-                side,
-                f"{size:g}",
-                "yes" if grows else "no",
-                " x ".join(map(str, ends[0])),
-                f"{np.nanmedian([one.revisits_closed for one in figures]):.2f}",
-                f"{closures}, {false}",
-                f"{np.median([one.em for one in metrics]):.3f}",
-                f"{np.median([one.arr for one in metrics]):.3f}",
-                f"{np.median(updates):.0f}",
-            ]
-        )
+        network = [side, f"{size:g}", "yes" if grows else "no", " x ".join(map(str, ends[0]))]
+        rows.append([*network, *_closed(figures), *_errors(figures), f"{np.median(updates):.0f}"])
     mazes = len(next(iter(result.values())))
     above = (
         f"Free exploration, {mazes} maze{'s' * (mazes > 1)}: medians, closures are sums. The usual network"

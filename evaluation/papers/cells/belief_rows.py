@@ -16,23 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.papers.cells.belief_world import (
-    AROUND,
-    CELLS,
-    LOOKS,
-    PARTICLES,
-    World,
-    additive,
-    circles,
-    exact,
-    network,
-    pace,
-    particles,
-    random_looks,
-    random_world,
-    room_closures,
-    see,
-)
+from evaluation.papers.cells import belief_world as worlds
+from evaluation.papers.cells.belief_world import AROUND, CELLS, LOOKS, PARTICLES, World, exact, network, pace
 from evaluation.papers.cells.panels import name_panel, panel_grid, table_lines
 from evaluation.papers.figure import Figure, Task
 from evaluation.plots import style
@@ -79,27 +64,28 @@ region with each probability of `REGIONS`."""
 def measure_posterior(task: Task, updates: int = UPDATES) -> tuple[_Scores, str]:
     """The scores of the network, of its references and of the control, and how the last two were set."""
     seeds = task.seeds(8)
-    worlds = [random_world(seed, updates) for seed in seeds]
-    side, moved, best = _converged(worlds)
-    alone = [_packet(world, belief) > ONE_PACKET for world, belief in zip(worlds, best, strict=True)]
-    novel = max(float(np.mean([world.truth < 0 for world in worlds])), 1 / updates)
+    courses = [worlds.random_world(seed, updates) for seed in seeds]
+    side, moved, best = _converged(courses)
+    alone = [_packet(world, belief) > ONE_PACKET for world, belief in zip(courses, best, strict=True)]
+    novel = max(float(np.mean([world.truth < 0 for world in courses])), 1 / updates)
 
     def scores(beliefs: Sequence[np.ndarray]) -> np.ndarray:
         rows = []
-        for world, belief, one in zip(worlds, beliefs, alone, strict=True):
+        for world, belief, one in zip(courses, beliefs, alone, strict=True):
             gain = log_gain(world, belief)
             rows.append([gain.mean(), gain[one].mean(), *inside(world, belief)])
         return np.array(rows)
 
     controls = {
-        setting: scores([additive(world, *setting, novel) for world in worlds]) for setting in ADDITIVE
+        setting: scores([worlds.additive(world, *setting, novel) for world in courses])
+        for setting in ADDITIVE
     }
     control = max(controls, key=lambda setting: float(controls[setting][:, 0].mean()))
     found = {
         EXACT: scores(best),
-        MANY: scores([particles(world, seed) for world, seed in zip(worlds, seeds, strict=True)]),
-        NETWORK: scores([network(world) for world in worlds]),
-        FINER: scores([network(world, cells=FINE_CELLS) for world in worlds]),
+        MANY: scores([worlds.particles(world, seed) for world, seed in zip(courses, seeds, strict=True)]),
+        NETWORK: scores([network(world) for world in courses]),
+        FINER: scores([network(world, cells=FINE_CELLS) for world in courses]),
         CONTROL: controls[control],
     }
     strength, inhibition, unsure = control
@@ -111,16 +97,16 @@ def measure_posterior(task: Task, updates: int = UPDATES) -> tuple[_Scores, str]
     return found, note
 
 
-def _converged(worlds: Sequence[World]) -> tuple[float, float, list[np.ndarray]]:
+def _converged(courses: Sequence[World]) -> tuple[float, float, list[np.ndarray]]:
     """Side of the cells of the histogram whose halving moves the score by less than `CLOSE_ENOUGH`, the share
     by which it moves it, and the beliefs at half the side."""
 
     def score(beliefs: Sequence[np.ndarray]) -> float:
-        return float(np.mean([log_gain(*pair).mean() for pair in zip(worlds, beliefs, strict=True)]))
+        return float(np.mean([log_gain(*pair).mean() for pair in zip(courses, beliefs, strict=True)]))
 
-    side, beliefs = 1.0, [exact(world, 1.0) for world in worlds]
+    side, beliefs = 1.0, [exact(world, 1.0) for world in courses]
     while True:
-        halved = [exact(world, side / 2) for world in worlds]
+        halved = [exact(world, side / 2) for world in courses]
         moved = abs(score(halved) / score(beliefs) - 1)
         if moved < CLOSE_ENOUGH:
             return side, moved, halved
@@ -155,7 +141,6 @@ def _near(world: World, places: np.ndarray) -> np.ndarray:
 
 
 def _table_posterior(result: tuple[_Scores, str]) -> list[str]:
-    """The lines of the table, and what it does not show."""
     found, note = result
     best = found[EXACT]
     columns = (
@@ -221,15 +206,15 @@ def alike_rooms(seed: int) -> World:
     them, with equal probability of either, and goes round it. It is in the first; the second lies elsewhere,
     at any angle."""
     random = stream(seed, "cells.alike_rooms")
-    room = circles(ROOM)
+    room = worlds.circles(ROOM)
     turn = random.uniform(-np.pi, np.pi)
     away = random.uniform(1.8, 2.6) * np.array([np.cos(turn), np.sin(turn)])
     other = compose(np.array([*away, random.uniform(-np.pi, np.pi)]), room)
-    looks = np.tile(random_looks(seed, len(room)), 2)
+    looks = np.tile(worlds.random_looks(seed, len(room)), 2)
     other_looks = looks[DIFFERENCE + 1 : AROUND] + random.integers(1, LOOKS, AROUND - DIFFERENCE - 1)
     looks[len(room) + DIFFERENCE + 1 : len(room) + AROUND] = other_looks % LOOKS
     truth = (1 + np.arange(COURSE)) % AROUND
-    likelihood, novelty = see(looks, truth, random)
+    likelihood, novelty = worlds.see(looks, truth, random)
     start = np.zeros(2 * len(room))
     start[[0, len(room)]] = 0.49
     return World(np.concatenate([room, other]), pace(np.ones(COURSE)), likelihood, novelty, truth, start)
@@ -248,7 +233,9 @@ def measure_rooms(task: Task, sessions: int = 3) -> _Rooms:
     evident = np.cumsum(np.abs(found[EXACT][:, 0] - 0.5) > SIGN, axis=1) > 0
     seeds = range(task.first, task.first + sessions)
     closures = [
-        list(run_tasks(partial(room_closures, difference=DIFFERENCE, alike=alike), seeds, task.workers))
+        list(
+            run_tasks(partial(worlds.room_closures, difference=DIFFERENCE, alike=alike), seeds, task.workers)
+        )
         for alike in (True, False)
     ]
     return found, evident, closures
@@ -258,7 +245,7 @@ def _beliefs(world: World) -> Iterator[tuple[str, np.ndarray]]:
     """Exact inference, the network, and the control at settings that suit `measure_posterior`."""
     yield EXACT, exact(world)
     yield NETWORK, network(world)
-    yield CONTROL, additive(world, *USUAL_CONTROL)
+    yield CONTROL, worlds.additive(world, *USUAL_CONTROL)
 
 
 USUAL_CONTROL = (0.3, 0.5, 0.1, 0.1)
@@ -266,7 +253,6 @@ USUAL_CONTROL = (0.3, 0.5, 0.1, 0.1)
 
 
 def _table_rooms(result: _Rooms) -> list[str]:
-    """The lines of the table, and what it does not show."""
     found, evident, closures = result
     columns = (
         "belief", "before: farthest from 1/2", "best packet, largest", "decided too early",
@@ -331,12 +317,12 @@ within `AFTER`; [n, T] probability of novelty."""
 
 def _kidnap_world(seed: int) -> World:
     """A robot that knows where it is goes round a circle, and is then set down on another one."""
-    random, poses = stream(seed, "cells.kidnap"), circles()
+    random, poses = stream(seed, "cells.kidnap"), worlds.circles()
     rings = random.permutation(len(poses) // AROUND)[:2]
     first = random.integers(0, AROUND, 2)
     arcs = [(first[k] + 1 + np.arange(count)) % AROUND for k, count in enumerate((KIDNAP, AFTER))]
     truth = np.concatenate([ring * AROUND + arc for ring, arc in zip(rings, arcs, strict=True)])
-    likelihood, novelty = see(random_looks(seed, len(poses)), truth, random)
+    likelihood, novelty = worlds.see(worlds.random_looks(seed, len(poses)), truth, random)
     start = np.zeros(len(poses))
     start[rings[0] * AROUND + first[0]] = 1.0
     return World(poses, pace(np.ones(len(truth))), likelihood, novelty, truth, start)
@@ -362,7 +348,6 @@ NO_ENTRY = "network without re-entry (control)"
 
 
 def _table_kidnaps(result: _Kidnaps) -> list[str]:
-    """The lines of the table, and what it does not show."""
     columns = (
         "belief", "found again", "updates until then: median", "slowest tenth", "novelty before", "its peak",
         "novelty at the end",
@@ -461,7 +446,6 @@ def measure_conflicts(task: Task) -> _Weights:
 
 
 def _table_conflicts(result: _Weights) -> list[str]:
-    """The lines of the table, and what it does not show."""
     names = list(dict.fromkeys(name for *_, name in result))
     columns = (
         "cues, with their reliability", "degrees apart", *(f"weight of the first: {name}" for name in names),

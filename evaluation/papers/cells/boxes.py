@@ -18,14 +18,8 @@ from scipy import fft
 
 from evaluation.cells.rate_map import bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.panels import name_panel, table_lines
-from evaluation.papers.cells.rat_sessions import (
-    RatSessions,
-    choose_columns,
-    column_activity,
-    rat_config,
-    rat_source,
-)
+from evaluation.papers.cells.panels import name_panel, panel_row, table_lines
+from evaluation.papers.cells.rat_sessions import RatSessions, choose_columns, column_activity, rat_config
 from evaluation.papers.figure import Figure, Task
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
@@ -80,12 +74,12 @@ def align_maps(first: np.ndarray, second: np.ndarray, bins: int, angles: Sequenc
         known = np.isfinite(fits)
         mean = np.where(known, fits, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
         y, x = np.unravel_index(mean.argmax(), mean.shape)
-        if mean[y, x] > mean_correlation(best[2]):
+        if mean[y, x] > _mean(best[2]):
             best = float(angle), (int(x), int(y)), fits[:, y, x]
     return best
 
 
-def mean_correlation(correlation: np.ndarray) -> float:
+def _mean(correlation: np.ndarray) -> float:
     """Mean over the cells [C] that have one; NaN if none has."""
     known = correlation[~np.isnan(correlation)]
     return float(known.mean()) if known.size else np.nan
@@ -167,7 +161,7 @@ def measure_boxes(task: Task, seconds: float = SECONDS, columns: int = COLUMNS) 
     phase: dict[str, Any] = {"start": 2 * seconds, "kidnap": PLACE, "box": BOX}
     rats, sessions = RatSessions(config), []
     for seed in task.seeds(USUAL):
-        source = rat_source(config, seed, walk={}, seconds=3 * seconds, phases=[phase])
+        source = rats.rat(seed, walk={}, seconds=3 * seconds, phases=[phase])
         side = source.config.box.width
         sessions.append(_fit_session(rats.run(source), seconds, side, columns))
     return sessions, side, network.cells_xy * network.cell_size
@@ -210,11 +204,10 @@ def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> _Fit:
 
 
 def _table_boxes(result: _Boxes) -> list[str]:
-    """The lines of the table, and what it does not show."""
     sessions, side, torus = result
 
     def spread(kind: str, pair: str, name: str) -> str:
-        means = [mean_correlation(fits[kind, pair][0][name]) for _, fits, _ in sessions]
+        means = [_mean(fits[kind, pair][0][name]) for _, fits, _ in sessions]
         return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
 
     figures = (
@@ -287,7 +280,7 @@ def _draw_boxes(result: _Boxes, png: Path) -> None:
     first, again, plain = (lay_on_torus(each, bins, 0.0) for each in maps)
     fitted = np.roll(lay_on_torus(maps[2], bins, angle), shift[::-1], axis=(1, 2))
     rows = {"A": first, "A again": again, "B": plain, f"B turned\n{np.degrees(angle):.0f}°, shifted": fitted}
-    still, best = (mean_correlation(each["A with B"]) for each in pairs.values())
+    still, best = (_mean(each["A with B"]) for each in pairs.values())
     line = (
         f"Box {side:g} m, torus {torus:g} m (ratio {side / torus:.2f}). Mean "
         f"correlation of A with B: {still:.2f}, after one turn and shift of all {best:.2f}."
@@ -325,18 +318,15 @@ def _draw_boxes(result: _Boxes, png: Path) -> None:
 
 
 def _draw_histograms(figure: style.Figure, pairs: Mapping[str, Mapping[str, np.ndarray]]) -> style.Axes:
-    gap = 0.7
-    width = (style.WIDTH - style.LEFT - style.RIGHT - (len(pairs) - 1) * gap) / len(pairs)
-    for k, (title, correlations) in enumerate(pairs.items()):
-        axes = style.add_axes(figure, style.LEFT + k * (width + gap), LOW, width, HEIGHT)
+    row = panel_row(figure, len(pairs), 0.7, LOW, HEIGHT)
+    for axes, (title, correlations) in zip(row, pairs.items(), strict=True):
         for (name, values), colour in zip(correlations.items(), COLOURS, strict=True):
             axes.hist(values, BINS.tolist(), color=colour, alpha=0.65, label=name)
             if len(values):
                 axes.axvline(values.mean(), color=colour, lw=1.4, ls="--")
-        axes.grid(color=style.LINE_GREY, lw=0.7)
         axes.set(xlim=(-1, 1), xticks=(-1, -0.5, 0, 0.5, 1))
         across = "correlation of two maps of a column (dashed: mean)"
-        name_panel(axes, title, across, "columns" if k == 0 else "")
+        name_panel(axes, title, across, "columns" if axes is row[0] else "")
     return axes
 
 

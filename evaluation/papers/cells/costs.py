@@ -71,7 +71,6 @@ def _map_and_tune(recording: CellRecording) -> None:
 
 
 def _table_analysis(result: tuple[str, Times]) -> list[str]:
-    """The lines of the table."""
     note, times = result
     rows = [
         (name, cells, f"{processor:.2f}", f"{wall:.2f}", goal)
@@ -127,7 +126,6 @@ def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> tuple[str, Tim
 
 
 def _table_networks(result: tuple[str, Times]) -> list[str]:
-    """The lines of the table."""
     note, rows = result
     columns = (
         "networks", "sets measured", "us a step and set", "wall us", "1,000 sets x 30,000 steps, min",

@@ -27,7 +27,7 @@ from evaluation.papers.cells.panels import (
     table_lines,
     torus_error,
 )
-from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
+from evaluation.papers.cells.rat_sessions import RatSessions, rat_config
 from evaluation.papers.figure import Figure, Task
 from evaluation.plots import style
 from evaluation.studies.study_course import StudyCourse, expected_poses, read_course
@@ -76,15 +76,14 @@ def measure_drift(task: Task, times: tuple[int, ...] = TIMES) -> _Drift:
     return times, [np.array(each) for each in zip(*found, strict=True)]
 
 
-def rms(errors: np.ndarray) -> np.ndarray:
+def _rms(errors: np.ndarray) -> np.ndarray:
     """[L, M, 2] root mean square over the seeds of errors [n, L, M, 2]."""
     return np.sqrt((errors**2).mean(axis=0))
 
 
 def _table_drift(result: _Drift) -> list[str]:
-    """The lines of the table, and what it does not show."""
     times, errors = result
-    packet, odometry, added = map(rms, errors)
+    packet, odometry, added = map(_rms, errors)
     above = [
         f"Root mean square over {len(errors[0])} seeds; a cell is 0.05 m and {np.radians(10):.2f} rad.",
         "Goal: the packet adds little to the error of odometry; heading: noise times the root of the time.",
@@ -119,7 +118,7 @@ def _draw_drift(result: _Drift, png: Path) -> None:
         levels = noise[rows, column].tolist()
         for quantity, up in enumerate(("error of position (m)", "error of heading (rad)")):
             panel = axes[quantity][column]
-            packet, odometry = (rms(each)[rows, :, quantity] for each in (packets, odometries))
+            packet, odometry = (_rms(each)[rows, :, quantity] for each in (packets, odometries))
             for j, time in enumerate(times):
                 colour = COLOURS[j % len(COLOURS)]
                 panel.plot(levels, packet[:, j], "-", color=colour, lw=1.6, label=f"packet after {time} s")
@@ -248,7 +247,6 @@ def _anchored_after(run: CellRecording, light: CellRecording, back: float) -> fl
 
 
 def _table_anchoring(result: _Anchoring) -> list[str]:
-    """The lines of the table, and what it does not show."""
     (begins, back, end), errors, times = result
     seeds = len(next(iter(errors.values())))
     above = [
@@ -326,7 +324,7 @@ def _run(sessions: RatSessions, schedule: _Schedule, path: str, test: str, seed:
         changed["path"] = {"file": path, "heading_smoothing": 0.25, "skip": start}
     if test == "dark":
         changed["phases"] = [{"start": begins, "end": back, "dark": True}]
-    source = rat_source(sessions.config, seed, **changed)
+    source = sessions.rat(seed, **changed)
     if test != "shuffled":
         return sessions.run(source)
     log = load_into_memory(source)

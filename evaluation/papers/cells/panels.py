@@ -63,24 +63,18 @@ def panel_grid(
     """
     whole = TOP + rows * height + (rows - 1) * GAP_UP + BOTTOM
     figure = style.new_figure(whole, title, line)
-    width = (style.WIDTH - style.LEFT - style.RIGHT - (columns - 1) * GAP_ACROSS) / columns
-    axes = [
-        [
-            style.add_axes(
-                figure,
-                style.LEFT + column * (width + GAP_ACROSS),
-                whole - TOP - height - row * (height + GAP_UP),
-                width,
-                height,
-            )
-            for column in range(columns)
-        ]
-        for row in range(rows)
-    ]
-    for line_of_axes in axes:
-        for each in line_of_axes:
-            each.grid(color=style.LINE_GREY, lw=0.7)
-    return figure, axes
+    bottoms = [whole - TOP - height - row * (height + GAP_UP) for row in range(rows)]
+    return figure, [panel_row(figure, columns, GAP_ACROSS, bottom, height) for bottom in bottoms]
+
+
+def panel_row(figure: Figure, count: int, gap: float, bottom: float, height: float) -> list[Axes]:
+    """Axes side by side over the width of a figure, with a light grid; lengths in inches."""
+    width = (style.WIDTH - style.LEFT - style.RIGHT - (count - 1) * gap) / count
+    lefts = [style.LEFT + k * (width + gap) for k in range(count)]
+    row = [style.add_axes(figure, left, bottom, width, height) for left in lefts]
+    for axes in row:
+        axes.grid(color=style.LINE_GREY, lw=0.7)
+    return row
 
 
 def name_panel(axes: Axes, title: str, across: str, up: str) -> None:

@@ -32,6 +32,17 @@ class RatSessions:
         self.config = config
         self._session: Session | None = None
 
+    def rat(self, seed: int, **changed: Any) -> RatSimulation:
+        """The rat of the configuration with another seed and with settings of `RatSimulationConfig` replaced.
+
+        Raises:
+            InputError: see `RatSimulation`.
+        """
+        own = self.config.rat_simulation
+        assert own is not None
+        given = {name: getattr(own, name) for name in own.model_fields_set}
+        return RatSimulation(RatSimulationConfig.model_validate({**given, "seed": seed, **changed}))
+
     def run(self, source: Source) -> CellRecording:
         """The recorded cells of T steps of a session over a source, from the start.
 
@@ -71,17 +82,6 @@ class RatSessions:
 def rat_config(*assignments: str) -> RunConfig:
     """The configuration `rat_box` with recorded packets, and settings `a.b=value` replaced."""
     return load_config(PACKAGED, ("cells={chosen: 0}", *assignments))
-
-
-def rat_source(config: RunConfig, seed: int, **changed: Any) -> RatSimulation:
-    """The rat of a configuration with another seed and with settings of `RatSimulationConfig` replaced.
-
-    Raises:
-        InputError: see `RatSimulation`.
-    """
-    assert config.rat_simulation is not None
-    given = {name: getattr(config.rat_simulation, name) for name in config.rat_simulation.model_fields_set}
-    return RatSimulation(RatSimulationConfig.model_validate({**given, "seed": seed, **changed}))
 
 
 Way = Literal["rat", "random walk"]

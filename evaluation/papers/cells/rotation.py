@@ -26,7 +26,7 @@ from evaluation.papers.cells.panels import (
     table_lines,
     torus_error,
 )
-from evaluation.papers.cells.rat_sessions import RatSessions, rat_config, rat_source
+from evaluation.papers.cells.rat_sessions import RatSessions, rat_config
 from evaluation.papers.figure import Figure, Task
 from evaluation.plots import style
 from tactile.base.se2 import wrap
@@ -95,9 +95,7 @@ def measure_rotation(task: Task, schedule: _Schedule = SCHEDULE) -> _Rotations:
     found, courses = [], []
     for _, degrees, phase in CONDITIONS:
         phases = [{"start": turned_at, **phase}] if phase else []
-        sources = (
-            rat_source(sessions.config, seed, seconds=end, phases=phases) for seed in task.seeds(USUAL)
-        )
+        sources = (sessions.rat(seed, seconds=end, phases=phases) for seed in task.seeds(USUAL))
         turns, course = zip(
             *(rotation_of(sessions.run(each), schedule, np.radians(degrees)) for each in sources), strict=True
         )
@@ -134,7 +132,6 @@ def rotation_of(
 
 
 def _table_rotation(result: _Rotations) -> list[str]:
-    """The lines of the table, and what it does not show."""
     (turned_at, late, end), kinds, _ = result
     above = (
         f"{kinds.shape[2]} seeds: median (lowest to highest), from {late:g} s to"

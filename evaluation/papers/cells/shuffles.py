@@ -85,7 +85,6 @@ def _compare(task: tuple[CellRecording, Way, str, str], true_cells: int, shuffle
 
 
 def _shuffle_table(result: tuple[str, list[_Row]]) -> list[str]:
-    """The lines of the table."""
     note, found = result
     rows = []
     for way, score, cells, true_share, true_mean in found:

@@ -27,14 +27,8 @@ from evaluation.cells.grid_score import (
 from evaluation.cells.rate_map import place_index, sample_seconds, smooth_rates
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import PathBins, ShuffledScores, shuffled_scores
-from evaluation.papers.cells.panels import table_lines
-from evaluation.papers.cells.rat_sessions import (
-    RatSessions,
-    choose_columns,
-    column_activity,
-    rat_config,
-    rat_source,
-)
+from evaluation.papers.cells.panels import panel_row, table_lines
+from evaluation.papers.cells.rat_sessions import RatSessions, choose_columns, column_activity, rat_config
 from evaluation.papers.figure import Figure, Task
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
@@ -95,8 +89,8 @@ def measure_torus(
     rats = RatSessions(config)
     recordings = [
         rats.run(
-            rat_source(
-                config, task.first, walk={"speed": 0.3, "speed_sd": 0.15}, seconds=time, odometry=DARK,
+            rats.rat(
+                task.first, walk={"speed": 0.3, "speed_sd": 0.15}, seconds=time, odometry=DARK,
                 box={"width": size[0], "height": size[1]}, phases=[{"start": 0, "dark": True}],
             )
         )
@@ -149,7 +143,6 @@ def measure_cells(
 
 
 def _table_torus(result: _Torus) -> list[str]:
-    """The lines of the table, and what it does not show."""
     large, single, small, torus = result
     above = (
         f"{len(large.maps)} columns. Medians over cells, in brackets the 2.5th and 97.5th percentile; "
@@ -283,11 +276,7 @@ def _draw_row(
 def _draw_histograms(
     figure: style.Figure, scores: Mapping[str, ShuffledScores], spacing: np.ndarray, torus: float
 ) -> style.Axes:
-    gap, count = 0.5, len(scores) + 1
-    width = (style.WIDTH - style.LEFT - style.RIGHT - (count - 1) * gap) / count
-    panels = [
-        style.add_axes(figure, style.LEFT + k * (width + gap), LOW, width, HEIGHT) for k in range(count)
-    ]
+    panels = panel_row(figure, len(scores) + 1, 0.5, LOW, HEIGHT)
     for axes, (name, found) in zip(panels, scores.items(), strict=False):
         known = found.score[np.isfinite(found.score)]
         shuffled = found.shuffled[np.isfinite(found.shuffled)]
@@ -301,6 +290,4 @@ def _draw_histograms(
     panels[-1].axvline(torus, color=style.VERMILLION, lw=1.4)
     panels[-1].set_title("red: side of the torus", fontsize=8, color=style.LABEL_GREY, loc="left")
     style.name_axes(panels[-1], "spacing, larger box (m)", "columns")
-    for axes in panels:
-        axes.grid(color=style.LINE_GREY, lw=0.7)
     return panels[0]

@@ -17,7 +17,7 @@ import numpy as np
 
 from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import RIGHT, WRONG, MapSteps
-from evaluation.papers.maps.localising import Judged, judge
+from evaluation.papers.maps.localising import Judged
 from evaluation.papers.maps.operations import Localised, MapTask, Measured, column, follow
 from evaluation.papers.maps.pictures import at_least, count, draw_panels, median, spread, table
 from evaluation.papers.maps.scenarios import draw_seed
@@ -60,7 +60,7 @@ def _measure_arena(task: MapTask, side: float = SMALL) -> Measured:
     other = localise(_drive_elsewhere(task.seed + 1, side)[0])
     reckoned = integrate(motion, truth[0]) - truth  # odometry that starts at the truth
     return arena_figures(
-        judge(steps, known, truth), judge(steps, mixed, truth), other, np.hypot(*reckoned[:, :2].T)
+        Judged.of(steps, known, truth), Judged.of(steps, mixed, truth), other, np.hypot(*reckoned[:, :2].T)
     )
 
 
@@ -88,50 +88,29 @@ def arena_figures(session: Judged, shuffled: Judged, other: Localised, reckoned:
 
 
 def _arena_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of unknown starts."""
     n, reports, mixed = len(found), column(found, "reports"), column(found, "shuffled")
     return table(
         *(
-            (
-                f"found and right within {within} reports",
-                at_least(0.95, n) if within == SOON else "-",
-                count(reports <= within),
-                f"{count(mixed <= within)} with shuffled contacts",
-            )
+            f"found and right within {within} reports | {at_least(0.95, n) if within == SOON else '-'} |"
+            f" {count(reports <= within)} | {count(mixed <= within)} with shuffled contacts"
             for within in (SOON, REPORTS)
         ),
-        ("reports until then, median (worst)", "-", f"{np.median(reports):.0f} ({reports.max():.0f})", "-"),
+        f"reports until then, median (worst) | - | {np.median(reports):.0f} ({reports.max():.0f}) | -",
         *(
-            (
-                f"most likely pose right after {within} reports, believed or not",
-                "-",
-                count(~column(found, name)),
-                "-",
-            )
+            f"most likely pose right after {within} reports, believed or not | - |"
+            f" {count(~column(found, name))} | -"
             for within, name in ((SOON, "best_wrong_soon"), (REPORTS, "best_wrong"))
         ),
-        (
-            "sure and wrong (> 0.18 m or 30 degrees)",
-            f"0 of {n}",
-            count(column(found, "sure_and_wrong")),
-            f"{count(column(found, 'shuffled_sure_and_wrong'))} shuffled",
-        ),
+        f"sure and wrong (> 0.18 m or 30 degrees) | 0 of {n} | {count(column(found, 'sure_and_wrong'))} |"
+        f" {count(column(found, 'shuffled_sure_and_wrong'))} shuffled",
         *(
-            (f"found in another arena within {within} reports", f"0 of {n}", count(column(found, name)), "-")
+            f"found in another arena within {within} reports | 0 of {n} | {count(column(found, name))} | -"
             for within, name in ((SOON, "found_elsewhere_soon"), (REPORTS, "found_elsewhere"))
         ),
-        (
-            f"says after {REPORTS} reports that this is not the map",
-            "-",
-            f"{count(~column(found, 'not_said'))} in another arena",
-            f"{count(column(found, 'denied'))} in that of the map",
-        ),
-        (
-            "error while found, m, median of sessions (worst)",
-            "-",
-            spread(column(found, "error"), 3),
-            f"{spread(column(found, 'odometry_error'), 3)} odometry from the true start",
-        ),
+        f"says after {REPORTS} reports that this is not the map | - | {count(~column(found, 'not_said'))} in"
+        f" another arena | {count(column(found, 'denied'))} in that of the map",
+        f"error while found, m, median of sessions (worst) | - | {spread(column(found, 'error'), 3)} |"
+        f" {spread(column(found, 'odometry_error'), 3)} odometry from the true start",
     )
 
 

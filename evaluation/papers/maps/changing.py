@@ -14,25 +14,12 @@ import numpy as np
 
 from evaluation.metrics.run_metrics import unjoined_share
 from evaluation.papers.figure import Figure
-from evaluation.papers.maps.localising import judge
-from evaluation.papers.maps.merged_maps import Join, judge_join, shown_paths
+from evaluation.papers.maps import scenarios
+from evaluation.papers.maps.localising import Judged
+from evaluation.papers.maps.merged_maps import Join
 from evaluation.papers.maps.operations import MapTask, Measured, column
 from evaluation.papers.maps.pictures import PathPanel, at_least, count, draw_panels, spread, table
-from evaluation.papers.maps.scenarios import (
-    LOCALISED,
-    REENTERED,
-    Recipe,
-    Recorded,
-    carried_sessions,
-    closed_door,
-    kidnapped,
-    moved_wall,
-    open_world,
-    record,
-    same_maze,
-    ten_circuits,
-    unknown_start,
-)
+from evaluation.papers.maps.scenarios import LOCALISED, REENTERED, Recipe, Recorded, record
 from evaluation.papers.trial_sessions import apply_control
 from robot.world.maze import CELL_SIDE
 
@@ -40,14 +27,14 @@ from robot.world.maze import CELL_SIDE
 def _measure_change(change: Callable[[int], tuple[Recipe, np.ndarray]], task: MapTask) -> Measured:
     """One changed maze in the map of ten circuits: a session before the change, one after it, and one as
     long without a change, in which no place should be named."""
-    made, (changed, places) = task.map_of(ten_circuits(task.seed)), change(task.seed)
-    started, driven = record(unknown_start(task.seed)), record(changed)
-    again = record(Recipe(same_maze(task.seed, 1).config, 0, driven.log.length))
+    made, (changed, places) = task.map_of(scenarios.ten_circuits(task.seed)), change(task.seed)
+    started, driven = record(scenarios.unknown_start(task.seed)), record(changed)
+    again = record(Recipe(scenarios.same_maze(task.seed, 1).config, 0, driven.log.length))
     steps, methods = made.arrays.steps, task.methods
     named = steps.true_places(methods.changes(made, driven).reshape(-1, 2))  # the surest first
     distance = np.hypot(*(named[:, None] - places).transpose(2, 0, 1)).min(axis=1)
-    before = judge(steps, methods.localise(made, started), started.truth)
-    after = judge(steps, methods.localise(made, driven), driven.truth)
+    before = Judged.of(steps, methods.localise(made, started), started.truth)
+    after = Judged.of(steps, methods.localise(made, driven), driven.truth)
     unchanged = len(methods.changes(made, again))
     figures = {
         "missed": after.whisks > LOCALISED,
@@ -61,7 +48,7 @@ def _measure_change(change: Callable[[int], tuple[Recipe, np.ndarray]], task: Ma
     marks = [("truly changed", places), ("named", named)]
     paths = PathPanel(
         "maze of the map, path after the change",
-        open_world(task.seed)[0],
+        scenarios.open_world(task.seed)[0],
         {"path": driven.truth[:, :2]},
         marks,
     )
@@ -69,33 +56,17 @@ def _measure_change(change: Callable[[int], tuple[Recipe, np.ndarray]], task: Ma
 
 
 def _change_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of changed mazes."""
     n = len(found)
     return table(
-        (
-            f"found and right within {LOCALISED} whisks after the change",
-            at_least(0.9, n),
-            count(~column(found, "missed")),
-            f"{count(~column(found, 'missed_before'))} before it",
-        ),
-        (
-            "sure and wrong at some whisk after the change",
-            "-",
-            count(column(found, "sure_and_wrong")),
-            f"{count(column(found, 'sure_and_wrong_before'))} before it",
-        ),
-        (
-            "surest place named within a cell of the change",
-            at_least(0.8, n),
-            count(~column(found, "not_named")),
-            f"{count(column(found, 'false_alarm'))} name a place in an unchanged maze",
-        ),
-        (
-            "places named farther away, median (worst)",
-            "-",
-            spread(column(found, "far_places"), 0),
-            f"{spread(column(found, 'unchanged'), 0)} in an unchanged maze",
-        ),
+        f"found and right within {LOCALISED} whisks after the change | {at_least(0.9, n)} |"
+        f" {count(~column(found, 'missed'))} | {count(~column(found, 'missed_before'))} before it",
+        f"sure and wrong at some whisk after the change | - | {count(column(found, 'sure_and_wrong'))} |"
+        f" {count(column(found, 'sure_and_wrong_before'))} before it",
+        f"surest place named within a cell of the change | {at_least(0.8, n)} |"
+        f" {count(~column(found, 'not_named'))} | {count(column(found, 'false_alarm'))} name a place in an"
+        " unchanged maze",
+        f"places named farther away, median (worst) | - | {spread(column(found, 'far_places'), 0)} |"
+        f" {spread(column(found, 'unchanged'), 0)} in an unchanged maze",
     )
 
 
@@ -118,7 +89,7 @@ def _draw_change(title: str, found: Sequence[Measured], png: Path) -> None:
 
 WALL, DOOR = (
     Figure(title, partial(_measure_change, change), _change_lines, partial(_draw_change, title), 10)
-    for title, change in (("A wall moved", moved_wall), ("A door closed", closed_door))
+    for title, change in (("A wall moved", scenarios.moved_wall), ("A door closed", scenarios.closed_door))
 )
 
 
@@ -129,12 +100,12 @@ ENERGY = 0.15
 def _measure_carried(task: MapTask) -> Measured:
     """One map, continued in its known part, in an unknown part, and in the known part with images in random
     order; the error in m, where it was tied on."""
-    first, entered, away, entry = carried_sessions(task.seed)
+    first, entered, away, entry = scenarios.carried_sessions(task.seed)
     made, inside = task.map_of(first), record(entered)
     mixed = Recorded(inside.config, apply_control(inside.log, "shuffled", task.seed))
 
     def extend(recorded: Recorded, entry: int) -> Join:
-        return judge_join(task.methods.extend(made, recorded), len(made.arrays.truth), entry)
+        return Join.of(task.methods.extend(made, recorded), len(made.arrays.truth), entry)
 
     known, unknown, shuffled = extend(inside, entry), extend(record(away), 0), extend(mixed, entry)
     figures = {
@@ -144,14 +115,14 @@ def _measure_carried(task: MapTask) -> Measured:
         "error": known.off,
         "shuffled_tied": shuffled.joined,
     }
-    paths = shown_paths(made.arrays.truth[:, :2], inside.truth[:, :2], known)
-    panel = PathPanel("a second session in the map of the first", open_world(task.seed)[0], paths)
+    paths = known.paths(made.arrays.truth, inside.truth)
+    panel = PathPanel("a second session in the map of the first", scenarios.open_world(task.seed)[0], paths)
     return Measured(figures, {"known": known, "unknown": unknown, "shuffled": shuffled, "paths": panel})
 
 
 def _measure_kidnaps(task: MapTask) -> Measured:
     """Maps a session with kidnaps; Energy Metrics in m^2 + rad^2."""
-    arrays = task.map_of(kidnapped(task.seed)).arrays
+    arrays = task.map_of(scenarios.kidnapped(task.seed)).arrays
     within = arrays.em_within_pieces
     figures = {
         "above_goal": within > ENERGY,
@@ -164,40 +135,28 @@ def _measure_kidnaps(task: MapTask) -> Measured:
 
 
 def _carried_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of carried robots."""
     n = len(found)
     known, unknown, shuffled = ([one.shown[name] for one in found] for name in PARTS)
     return table(
-        (
-            f"tied on rightly after {REENTERED} whisks in the known part",
-            at_least(0.9, n),
-            count([one.right for one in known]),
-            f"{count([one.right for one in shuffled])} with shuffled images",
-        ),
-        (
-            "wrong ties, known and unknown part",
-            f"0 of {2 * n}",
-            count([one.wrong for one in known + unknown]),
-            f"{count([one.wrong for one in shuffled])} with shuffled images",
-        ),
-        ("ties in the unknown part, never re-entered", "-", count([one.joined for one in unknown]), "-"),
-        ("error of tied sessions, m, median (worst)", "-", spread(column(found, "error"), 3), "-"),
+        f"tied on rightly after {REENTERED} whisks in the known part | {at_least(0.9, n)} |"
+        f" {count([one.right for one in known])} | {count([one.right for one in shuffled])} with shuffled"
+        " images",
+        f"wrong ties, known and unknown part | 0 of {2 * n} |"
+        f" {count([one.wrong for one in known + unknown])} | {count([one.wrong for one in shuffled])} with"
+        " shuffled images",
+        f"ties in the unknown part, never re-entered | - | {count([one.joined for one in unknown])} | -",
+        f"error of tied sessions, m, median (worst) | - | {spread(column(found, 'error'), 3)} | -",
     )
 
 
 def _kidnap_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of kidnapped robots."""
     within, over_all = column(found, "em_within_pieces"), column(found, "em")
     return table(
-        (
-            f"EM within pieces up to {ENERGY}",
-            at_least(10 / 12, len(found)),
-            count(within <= ENERGY),
-            f"{count(over_all <= ENERGY)} over all pairs",
-        ),
-        ("EM within pieces, median (worst)", "-", spread(within, 3), f"{spread(over_all)} over all pairs"),
-        ("share outside the largest piece", "-", spread(column(found, "unjoined")), "-"),
-        ("pieces", "-", spread(column(found, "pieces"), 0), "-"),
+        f"EM within pieces up to {ENERGY} | {at_least(10 / 12, len(found))} | {count(within <= ENERGY)} |"
+        f" {count(over_all <= ENERGY)} over all pairs",
+        f"EM within pieces, median (worst) | - | {spread(within, 3)} | {spread(over_all)} over all pairs",
+        f"share outside the largest piece | - | {spread(column(found, 'unjoined'))} | -",
+        f"pieces | - | {spread(column(found, 'pieces'), 0)} | -",
     )
 
 

@@ -135,20 +135,17 @@ class Drive(NamedTuple):
     """A drive to one goal.
 
     Attributes:
-        state, reason: its end. whisks: their number. replans: new ways.
-        error: true distance from the goal at the end, m, by the nearest step of the map
-            (`evaluation.papers.maps.localisation_metrics`). reckoned: true distance, m, from where the noisy
-            odometry puts the robot, summed from the start of the first drive on. by_arm: distance from the
-            goal, m, at which exact motion from the end of the map to the goal's pose in the map would have
-            ended. length: of the true path, m. shortest: way over driven cells, m. clearance: least distance
-            of the head's axis from a wall on the way, m. clear: whether no whisker at rest was inside a wall.
-        path: [n, 2] true, m. goal: [2] its true place, m.
+        state: its end. goal: [2] its true place, m. replans: number of new ways. error: true distance from
+            the goal at the end, m, by the nearest step of the map (`MapSteps`). reckoned: true distance, m,
+            from where the noisy odometry puts the robot, summed from the start of the first drive on. by_arm:
+            distance from the goal, m, at which exact motion from the end of the map to the goal's pose in the
+            map would have ended. length: of the true path, m. shortest: way over driven cells, m. clearance:
+            least distance of the head's axis from a wall on the way, m. clear: whether no whisker at rest was
+            inside a wall. path: [n, 2] true, m.
     """
 
     state: DriveState
-    reason: str
     goal: np.ndarray
-    whisks: int
     replans: int
     error: float
     reckoned: float
@@ -269,7 +266,7 @@ class ClosedLoop:
         path, walls = poses[:, :2], self._arm.surroundings
         error, reckoned, by_arm = self._errors(experience)
         return Drive(
-            drive.state, drive.reason, place, whisks, drive.replans, error, reckoned, by_arm,
+            drive.state, place, drive.replans, error, reckoned, by_arm,
             float(np.hypot(*np.diff(path, axis=0).T).sum()),
             shortest_driven(self.scene.loop, path[0], place)[0],
             clearance(walls.walls, path),
@@ -377,58 +374,31 @@ def goal_figures(
 
 
 def _goal_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of drives to goals."""
     free, walled = ([drive for one in found for drive in one.shown[name]] for name in ("free", "walled"))
     n, drives, done = len(free), free + walled, [one for one in free if one.said_reached]
     ratio = np.array([one.length for one in done]).sum() / max(
         np.array([one.shortest for one in done]).sum(), 1e-9
     )
     return table(
-        (
-            f"reached (truly within {RIGHT.distance:g} m)",
-            f"{n} of {n}",
-            count([one.reached for one in free]),
-            f"{count([one.reckoned <= RIGHT.distance for one in free])} by odometry alone, "
-            f"{count([one.by_arm <= RIGHT.distance for one in free])} by the arm's exact motion alone",
-        ),
-        (
-            "said to be reached at a wrong place",
-            f"0 of {len(drives)}",
-            count([one.said_reached and not one.reached for one in drives]),
-            "-",
-        ),
-        (
-            "error where reached, m, median (worst)",
-            "-",
-            spread([one.error for one in done], 3),
-            f"{spread([one.reckoned for one in free], 3)} odometry, "
-            f"{spread([one.by_arm for one in free], 3)} the arm's exact motion",
-        ),
-        ("path over the shortest driven way, all reached", f"{RATIO:g}", f"{ratio:.2f}", "-"),
-        (
-            "least distance of the head's axis from a wall, m",
-            "-",
-            f"{min(one.clearance for one in drives):.3f}",
-            f"{min(one.shown['mapping'] for one in found):.3f} while mapping",
-        ),
-        (
-            "no whisker at rest inside a wall on the way",
-            f"{len(drives)} of {len(drives)}",
-            count([one.clear for one in drives]),
-            "-",
-        ),
-        (
-            "duration of all drives, min",
-            f"{MINUTES}",
-            f"{max(one.record['seconds'] for one in found) / 60:.0f}",
-            "-",
-        ),
-        (
-            "wall in the way: reached by a new way, or blocked",
-            f"{len(walled)} of {len(walled)}",
-            count([one.solved for one in walled]),
-            f"{sum(one.state is DriveState.BLOCKED for one in free)} of {n} blocked without a wall",
-        ),
+        f"reached (truly within {RIGHT.distance:g} m) | {n} of {n} | {count([one.reached for one in free])}"
+        f" | {count([one.reckoned <= RIGHT.distance for one in free])} by odometry alone,"
+        f" {count([one.by_arm <= RIGHT.distance for one in free])} by the arm's exact motion alone",
+        f"said to be reached at a wrong place | 0 of {len(drives)} |"
+        f" {count([one.said_reached and (not one.reached) for one in drives])} | -",
+        f"error where reached, m, median (worst) | - | {spread([one.error for one in done], 3)} |"
+        f" {spread([one.reckoned for one in free], 3)} odometry, {spread([one.by_arm for one in free], 3)}"
+        " the arm's exact motion",
+        f"path over the shortest driven way, all reached | {RATIO:g} | {ratio:.2f} | -",
+        "least distance of the head's axis from a wall, m | - |"
+        f" {min(one.clearance for one in drives):.3f} | {min(one.shown['mapping'] for one in found):.3f}"
+        " while mapping",
+        f"no whisker at rest inside a wall on the way | {len(drives)} of {len(drives)} |"
+        f" {count([one.clear for one in drives])} | -",
+        f"duration of all drives, min | {MINUTES} | {max(one.record['seconds'] for one in found) / 60:.0f}"
+        " | -",
+        f"wall in the way: reached by a new way, or blocked | {len(walled)} of {len(walled)} |"
+        f" {count([one.solved for one in walled])} |"
+        f" {sum(one.state is DriveState.BLOCKED for one in free)} of {n} blocked without a wall",
     )
 
 

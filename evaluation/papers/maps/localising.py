@@ -4,23 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from evaluation.papers.figure import Figure
+from evaluation.papers.maps import scenarios
 from evaluation.papers.maps.localisation_metrics import RIGHT, WRONG, MapSteps, pose_errors
 from evaluation.papers.maps.operations import Localised, MapTask, Measured, column
 from evaluation.papers.maps.pictures import PathPanel, at_least, count, draw_panels, median, spread, table
-from evaluation.papers.maps.scenarios import (
-    FOREIGN,
-    LOCALISED,
-    Recorded,
-    open_world,
-    record,
-    ten_circuits,
-    unknown_start,
-)
+from evaluation.papers.maps.scenarios import FOREIGN, LOCALISED, record
 from evaluation.papers.trial_sessions import apply_control
 from tactile.base.se2 import integrate
 
@@ -30,8 +23,7 @@ class Judged(NamedTuple):
 
     Attributes:
         found, foreign: [T] bool, as said. right, wrong: [T] bool, found and within `RIGHT`, found and beyond
-            `WRONG`. error: [T, 2] m and rad, against the nearest step of the map. aligned: [T, 2] after the
-            alignment of the map to the truth.
+            `WRONG`. error: [T, 2] m and rad, against the nearest step of the map.
     """
 
     found: np.ndarray
@@ -39,7 +31,18 @@ class Judged(NamedTuple):
     right: np.ndarray
     wrong: np.ndarray
     error: np.ndarray
-    aligned: np.ndarray
+
+    @classmethod
+    def of(cls, steps: MapSteps, localised: Localised, truth: np.ndarray) -> Self:
+        """A session beside its true poses [T, 3]."""
+        error = steps.errors(localised.pose, truth, RIGHT.distance)
+        return cls(
+            found=localised.found,
+            foreign=localised.foreign,
+            right=localised.found & RIGHT.holds(error),
+            wrong=localised.found & WRONG.exceeded(error),
+            error=error,
+        )
 
     @property
     def whisks(self) -> float:
@@ -47,35 +50,23 @@ class Judged(NamedTuple):
         return int(np.argmax(self.right)) + 1 if self.right.any() else np.inf
 
 
-def judge(steps: MapSteps, localised: Localised, truth: np.ndarray) -> Judged:
-    """A session beside its true poses [T, 3]."""
-    error = steps.errors(localised.pose, truth, RIGHT.distance)
-    return Judged(
-        found=localised.found,
-        foreign=localised.foreign,
-        right=localised.found & RIGHT.holds(error),
-        wrong=localised.found & WRONG.exceeded(error),
-        error=error,
-        aligned=pose_errors(steps.align(localised.pose), truth),
-    )
-
-
 def _measure_start(task: MapTask) -> Measured:
     """One unknown start in the map of ten circuits; errors in m, while found."""
-    made, recorded = task.map_of(ten_circuits(task.seed)), record(unknown_start(task.seed))
+    made = task.map_of(scenarios.ten_circuits(task.seed))
+    recorded = record(scenarios.unknown_start(task.seed))
     steps, truth = made.arrays.steps, recorded.truth
     localised = task.methods.localise(made, recorded)
-    mixed = Recorded(recorded.config, apply_control(recorded.log, "shuffled", task.seed))
-    session = judge(steps, localised, truth)
-    shuffled = judge(steps, task.methods.localise(made, mixed), truth)
+    mixed = scenarios.Recorded(recorded.config, apply_control(recorded.log, "shuffled", task.seed))
+    session = Judged.of(steps, localised, truth)
+    shuffled = Judged.of(steps, task.methods.localise(made, mixed), truth)
     reckoned = integrate(recorded.log.motion[:, :3], truth[0])  # odometry that starts at the truth
-    found = localised.found
+    found, said = localised.found, steps.align(localised.pose)
     figures = {
         "missed": session.whisks > LOCALISED,
         "sure_and_wrong": bool(session.wrong.any()),
         "whisks": session.whisks,
         "error": median(session.error[found, 0]),
-        "error_aligned": median(session.aligned[found, 0]),
+        "error_aligned": median(pose_errors(said, truth)[found, 0]),
         "odometry_error": median(np.hypot(*(reckoned - truth)[:, :2].T)),
         "shuffled_found": shuffled.whisks <= LOCALISED,
         "shuffled_sure_and_wrong": bool(shuffled.wrong.any()),
@@ -83,17 +74,17 @@ def _measure_start(task: MapTask) -> Measured:
     paths = {
         "map": steps.truth[:, :2],
         "true path": truth[:, :2],
-        "found": np.where(found[:, None], steps.align(localised.pose)[:, :2], np.nan),
+        "found": np.where(found[:, None], said[:, :2], np.nan),
     }
     curve = np.where(found, session.error[:, 0], np.nan)
-    return Measured(figures, {"maze": open_world(task.seed)[0], "paths": paths, "curve": curve})
+    return Measured(figures, {"maze": scenarios.open_world(task.seed)[0], "paths": paths, "curve": curve})
 
 
 def _measure_foreign(task: MapTask) -> Measured:
     """One session in another maze, and one in the maze of the map."""
-    made = task.map_of(ten_circuits(task.seed))
-    other = task.methods.localise(made, record(unknown_start(task.seed + 1, FOREIGN, "foreign")))
-    known = task.methods.localise(made, record(unknown_start(task.seed)))
+    made = task.map_of(scenarios.ten_circuits(task.seed))
+    other = task.methods.localise(made, record(scenarios.unknown_start(task.seed + 1, FOREIGN, "foreign")))
+    known = task.methods.localise(made, record(scenarios.unknown_start(task.seed)))
     figures = {
         "found_elsewhere": bool(other.found.any()),
         "not_said": not other.foreign[-1],
@@ -104,47 +95,26 @@ def _measure_foreign(task: MapTask) -> Measured:
 
 
 def _start_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of unknown starts."""
     n, whisks = len(found), column(found, "whisks")
     return table(
-        (
-            f"found and right within {LOCALISED} whisks",
-            at_least(0.95, n),
-            count(whisks <= LOCALISED),
-            f"{count(column(found, 'shuffled_found'))} with shuffled images",
-        ),
-        ("whisks until then, median (worst)", "25", f"{np.median(whisks):.0f} ({whisks.max():.0f})", "-"),
-        (
-            "sure and wrong (> 0.18 m or 30 degrees)",
-            f"0 of {n}",
-            count(column(found, "sure_and_wrong")),
-            f"{count(column(found, 'shuffled_sure_and_wrong'))} with shuffled images",
-        ),
-        (
-            "error while found, m, median of sessions (worst)",
-            "-",
-            spread(column(found, "error"), 3),
-            f"{spread(column(found, 'odometry_error'), 3)} odometry from the true start",
-        ),
-        ("the same after the alignment of the map", "-", spread(column(found, "error_aligned"), 3), "-"),
+        f"found and right within {LOCALISED} whisks | {at_least(0.95, n)} | {count(whisks <= LOCALISED)} |"
+        f" {count(column(found, 'shuffled_found'))} with shuffled images",
+        f"whisks until then, median (worst) | 25 | {np.median(whisks):.0f} ({whisks.max():.0f}) | -",
+        f"sure and wrong (> 0.18 m or 30 degrees) | 0 of {n} | {count(column(found, 'sure_and_wrong'))} |"
+        f" {count(column(found, 'shuffled_sure_and_wrong'))} with shuffled images",
+        f"error while found, m, median of sessions (worst) | - | {spread(column(found, 'error'), 3)} |"
+        f" {spread(column(found, 'odometry_error'), 3)} odometry from the true start",
+        f"the same after the alignment of the map | - | {spread(column(found, 'error_aligned'), 3)} | -",
     )
 
 
 def _foreign_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of sessions in other mazes."""
     return table(
-        (
-            f"found in another maze, {FOREIGN} whisks",
-            f"0 of {len(found)}",
-            count(column(found, "found_elsewhere")),
-            f"{count(~column(found, 'known_missed'))} in the maze of the map, {LOCALISED} whisks",
-        ),
-        (
-            "says at the end that this is not the map",
-            "-",
-            count(~column(found, "not_said")),
-            f"{count(column(found, 'known_denied'))} in the maze of the map",
-        ),
+        f"found in another maze, {FOREIGN} whisks | 0 of {len(found)} |"
+        f" {count(column(found, 'found_elsewhere'))} | {count(~column(found, 'known_missed'))} in the maze"
+        f" of the map, {LOCALISED} whisks",
+        f"says at the end that this is not the map | - | {count(~column(found, 'not_said'))} |"
+        f" {count(column(found, 'known_denied'))} in the maze of the map",
     )
 
 

@@ -9,11 +9,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from evaluation.papers.figure import Figure
+from evaluation.papers.maps import scenarios
 from evaluation.papers.maps.localisation_metrics import (
     BUILDING,
     RIGHT,
@@ -25,15 +26,7 @@ from evaluation.papers.maps.localisation_metrics import (
 )
 from evaluation.papers.maps.operations import MapTask, Measured, column
 from evaluation.papers.maps.pictures import PathPanel, at_least, count, draw_panels, spread, table
-from evaluation.papers.maps.scenarios import (
-    Recipe,
-    Recorded,
-    open_world,
-    overlapping_sessions,
-    record,
-    same_maze,
-    ten_circuits,
-)
+from evaluation.papers.maps.scenarios import Recipe, record
 from evaluation.papers.maps.stored_maps import MapArrays, StoredMap
 from evaluation.papers.tables.recordings import metres
 from ratslam.runs.settings.packaged import find_config
@@ -58,6 +51,28 @@ class Join(NamedTuple):
     error: np.ndarray
     path: np.ndarray
 
+    @classmethod
+    def of(cls, arrays: MapArrays, earlier: int, entry: int = 0, revisits: bool = False) -> Self:
+        """Compares the steps after the first `earlier` ones with these.
+
+        Args:
+            entry: number of later steps that are left out first. revisits: whether to compare revisits alone
+                (`REVISIT`).
+        """
+        first, last = slice(earlier), slice(earlier + entry, None)
+        piece = _most_common(arrays.piece[first])
+        inside = arrays.piece[first] == piece
+        steps = MapSteps.known(arrays.trajectory[first][inside], arrays.truth[first][inside])
+        pose, truth = arrays.trajectory[last], arrays.truth[last]
+        if revisits:
+            again = steps.revisited(truth, REVISIT)
+            pose, truth = pose[again], truth[again]
+        error = steps.errors(pose, truth, RIGHT.distance)
+        known = np.isfinite(error).all(axis=1)
+        middle = np.median(error[known], axis=0) if known.any() else np.full(2, np.nan)
+        path = steps.align(arrays.trajectory[earlier:])[:, :2]
+        return cls(piece == _most_common(arrays.piece[last]), middle, path)
+
     @property
     def right(self) -> bool:
         """Joined, and not off by more than `WRONG`."""
@@ -73,34 +88,11 @@ class Join(NamedTuple):
         """Error of position, m; NaN if not joined."""
         return float(self.error[0]) if self.joined else np.nan
 
-
-def shown_paths(first: np.ndarray, second: np.ndarray, join: Join) -> dict[str, np.ndarray]:
-    """Paths [.., 2] (m) of two sessions by label: the true ones, and that of the second one in the map of the
-    first if they are joined."""
-    paths = {"first session": first, "second, true": second}
-    return paths | {"second, in the map": join.path} if join.joined else paths
-
-
-def judge_join(arrays: MapArrays, earlier: int, entry: int = 0, revisits: bool = False) -> Join:
-    """Compares the steps after the first `earlier` ones with these.
-
-    Args:
-        entry: number of later steps that are left out first. revisits: whether to compare revisits alone
-            (`REVISIT`).
-    """
-    first, last = slice(earlier), slice(earlier + entry, None)
-    piece = _most_common(arrays.piece[first])
-    joined = piece == _most_common(arrays.piece[last])
-    inside = arrays.piece[first] == piece
-    steps = MapSteps.known(arrays.trajectory[first][inside], arrays.truth[first][inside])
-    pose, truth = arrays.trajectory[last], arrays.truth[last]
-    if revisits:
-        again = steps.revisited(truth, REVISIT)
-        pose, truth = pose[again], truth[again]
-    error = steps.errors(pose, truth, RIGHT.distance)
-    known = np.isfinite(error).all(axis=1)
-    middle = np.median(error[known], axis=0) if known.any() else np.full(2, np.nan)
-    return Join(joined, middle, steps.align(arrays.trajectory[earlier:])[:, :2])
+    def paths(self, first: np.ndarray, second: np.ndarray) -> dict[str, np.ndarray]:
+        """Paths [.., 2] (m) of two sessions by label: of true poses [.., 3], and, if they are joined, that of
+        the second one in the map of the first."""
+        paths = {"first session": first[:, :2], "second, true": second[:, :2]}
+        return paths | {"second, in the map": self.path} if self.joined else paths
 
 
 def _most_common(pieces: np.ndarray) -> int:
@@ -119,9 +111,9 @@ SESSIONS = 10
 def _measure_overlap(task: MapTask) -> Measured:
     """Merges one pair of sessions, beside one session over both; Energy Metrics in m^2 + rad^2, and the error
     in m, where they are joined."""
-    one, other, both = (task.map_of(recipe) for recipe in overlapping_sessions(task.seed))
+    one, other, both = (task.map_of(recipe) for recipe in scenarios.overlapping_sessions(task.seed))
     arrays = _merge(task, one, other)
-    join = judge_join(arrays, len(one.arrays.truth), revisits=True)
+    join = Join.of(arrays, len(one.arrays.truth), revisits=True)
     figures = {
         "not_joined": not join.right,
         "wrong_join": join.wrong,
@@ -129,17 +121,17 @@ def _measure_overlap(task: MapTask) -> Measured:
         "em_alone": both.arrays.em,
         "error": join.off,
     }
-    paths = shown_paths(one.arrays.truth[:, :2], other.arrays.truth[:, :2], join)
-    panel = PathPanel("two sessions that share half their cells", open_world(task.seed)[0], paths)
+    paths = join.paths(one.arrays.truth, other.arrays.truth)
+    panel = PathPanel("two sessions that share half their cells", scenarios.open_world(task.seed)[0], paths)
     return Measured(figures, {"joined": join.joined, "paths": panel})
 
 
 def _measure_different(task: MapTask) -> Measured:
     """Merges the sessions of two mazes, and two of one maze."""
-    one = task.map_of(ten_circuits(task.seed))
+    one = task.map_of(scenarios.ten_circuits(task.seed))
     other, again = (
-        judge_join(_merge(task, one, task.map_of(recipe)), len(one.arrays.truth)).joined
-        for recipe in (ten_circuits(task.seed + 1), same_maze(task.seed, 1))
+        Join.of(_merge(task, one, task.map_of(recipe)), len(one.arrays.truth)).joined
+        for recipe in (scenarios.ten_circuits(task.seed + 1), scenarios.same_maze(task.seed, 1))
     )
     return Measured({"mazes_joined": other, "maze_not_joined": not again}, {})
 
@@ -147,7 +139,7 @@ def _measure_different(task: MapTask) -> Measured:
 def _measure_ten(task: MapTask) -> Measured:
     """Merges ten sessions of one maze one by one: Energy Metric (m^2 + rad^2) and keyframes of the map after
     each, beside those of the sessions by themselves and without merging."""
-    maps = [task.map_of(same_maze(task.seed, number)) for number in range(SESSIONS)]
+    maps = [task.map_of(scenarios.same_maze(task.seed, number)) for number in range(SESSIONS)]
     merged = [maps[0]]
     with TemporaryDirectory() as folder:
         for number, one in enumerate(maps[1:], 1):
@@ -167,45 +159,31 @@ def _measure_ten(task: MapTask) -> Measured:
 
 
 def _overlap_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of sessions that overlap."""
     n, joined = len(found), column(found, "joined")
     union, alone = (column(found, name)[joined] for name in ("em_union", "em_alone"))
     ratio = np.median(union) / np.median(alone) if joined.any() else np.nan
     return table(
-        ("joined rightly", at_least(0.9, n), count(~column(found, "not_joined")), "row of two mazes"),
-        ("wrong joins", f"0 of {n}", count(column(found, "wrong_join")), "row of two mazes"),
-        (
-            "EM of the union, median (worst), of joined",
-            "-",
-            spread(union, 3),
-            f"{spread(alone, 3)} of one session over both",
-        ),
-        ("ratio of the medians", f"{UNION}", f"{ratio:.2f}", f"{spread(union / alone)} of each pair"),
+        f"joined rightly | {at_least(0.9, n)} | {count(~column(found, 'not_joined'))} | row of two mazes",
+        f"wrong joins | 0 of {n} | {count(column(found, 'wrong_join'))} | row of two mazes",
+        f"EM of the union, median (worst), of joined | - | {spread(union, 3)} | {spread(alone, 3)} of one"
+        " session over both",
+        f"ratio of the medians | {UNION} | {ratio:.2f} | {spread(union / alone)} of each pair",
     )
 
 
 def _different_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of two mazes."""
     different, same = column(found, "mazes_joined"), ~column(found, "maze_not_joined")
-    return table(("joined", f"0 of {len(found)}", count(different), f"{count(same)} of one maze"))
+    return table(f"joined | 0 of {len(found)} | {count(different)} | {count(same)} of one maze")
 
 
 def _ten_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of ten sessions."""
     return table(
-        ("all sessions in one piece", "-", count(~column(found, "not_joined")), "-"),
-        (
-            "EM after ten sessions, over that after one",
-            f"{GROWTH}",
-            spread(column(found, "em_growth")),
-            f"{spread(column(found, 'em_alone'))} sessions by themselves",
-        ),
-        (
-            "keyframes after ten sessions, over those after one",
-            f"{FRAMES}",
-            spread(column(found, "frames_growth")),
-            f"{spread(column(found, 'frames_separate'))} without merging",
-        ),
+        f"all sessions in one piece | - | {count(~column(found, 'not_joined'))} | -",
+        f"EM after ten sessions, over that after one | {GROWTH} | {spread(column(found, 'em_growth'))} |"
+        f" {spread(column(found, 'em_alone'))} sessions by themselves",
+        f"keyframes after ten sessions, over those after one | {FRAMES} |"
+        f" {spread(column(found, 'frames_growth'))} | {spread(column(found, 'frames_separate'))} without"
+        " merging",
     )
 
 
@@ -300,7 +278,7 @@ def _measure_halves(task: MapTask) -> Measured:
     views[seen] = views[random.permutation(seen)]
     label[given] = label[random.permutation(given)]
     log = replace(log, digest=f"{log.digest}+shuffled", views=views, label=label)
-    mixed = task.methods.localise(first, Recorded(recorded.config, log))
+    mixed = task.methods.localise(first, scenarios.Recorded(recorded.config, log))
     again, at = steps.revisited(truth, BUILDING), localised.found
 
     def shares(found: np.ndarray, pose: np.ndarray) -> tuple[float, float]:
@@ -339,32 +317,19 @@ def _measure_halves(task: MapTask) -> Measured:
 
 
 def _halves_lines(found: Sequence[Measured]) -> list[str]:
-    """The lines of each recording."""
     rows = []
     for one, shown in found:
         name, joined = shown["name"], ", halves not joined" if one["not_joined"] else ""
         ratio = f"{metres(one['ate_merged'])} m, {one['ate_merged'] / one['ate_whole']:.2f} times"
         rows += [
-            (
-                f"{name}: ATE of the merged halves",
-                f"{RATIO} times",
-                ratio + joined,
-                f"{metres(one['ate_whole'])} m whole",
-            ),
-            (
-                f"{name}: found at {shown['revisited']} revisits",
-                f"{FOUND:.0%}",
-                f"{one['found']:.1%}",
-                f"{one['shuffled_found']:.1%} in random order",
-            ),
-            (
-                f"{name}: found and off by 2 m or 30 degrees",
-                f"{OFF:.0%}",
-                f"{one['off']:.1%}",
-                f"{one['off_by_map']:.1%} a perfect localiser there; {one['shuffled_off']:.1%} in random"
-                f" order; {one['off_by_odometry']:.1%} odometry from the true start",
-            ),
-            (f"{name}: the same against the nearest step of the map", "-", f"{one['off_nearby']:.1%}", "-"),
+            f"{name}: ATE of the merged halves | {RATIO} times | {ratio + joined} |"
+            f" {metres(one['ate_whole'])} m whole",
+            f"{name}: found at {shown['revisited']} revisits | {FOUND:.0%} | {one['found']:.1%} |"
+            f" {one['shuffled_found']:.1%} in random order",
+            f"{name}: found and off by 2 m or 30 degrees | {OFF:.0%} | {one['off']:.1%} |"
+            f" {one['off_by_map']:.1%} a perfect localiser there; {one['shuffled_off']:.1%} in random order;"
+            f" {one['off_by_odometry']:.1%} odometry from the true start",
+            f"{name}: the same against the nearest step of the map | - | {one['off_nearby']:.1%} | -",
         ]
     return table(*rows)
 

@@ -1,18 +1,15 @@
-"""What is measured of saved maps: the operations of this program on them, in tasks, session by session.
-
-Operations are functions of a module, so that other processes can import them, and tests can measure others.
-"""
+"""What is measured of saved maps: the operations of this program on them, in tasks, session by session."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.papers.figure import Figure, find_figure, write_page
+from evaluation.papers.figure import MAPS, Figure, find_figure, write_page
 from evaluation.papers.maps.scenarios import Recipe, Recorded
 from evaluation.papers.maps.stored_maps import STEPS, MapArrays, StoredMap, store_map
 from evaluation.papers.tables.comparison import Files, Record, SessionLog, compare_figures
@@ -41,22 +38,6 @@ class Localised(NamedTuple):
     found: np.ndarray
     foreign: np.ndarray
     pose: np.ndarray
-
-
-class Methods(NamedTuple):
-    """Operations on saved maps; functions of a module, so that other processes can import them.
-
-    Attributes:
-        localise: a session in a map. extend: the map of a session and then another one, whose robot may stand
-            anywhere: its arrays are over the steps of both, in this order. merge: one map of several, written
-            to a new path, and its arrays over the steps of all, in the order of the arguments. changes:
-            places [n, 2] of a map (m) where a session says that it no longer agrees, the surest first.
-    """
-
-    localise: Callable[[StoredMap, Recorded], Localised]
-    extend: Callable[[StoredMap, Recorded], MapArrays]
-    merge: Callable[[Sequence[StoredMap], Path], StoredMap]
-    changes: Callable[[StoredMap, Recorded], np.ndarray]
 
 
 class Measured(NamedTuple):
@@ -93,17 +74,6 @@ class MapTask(NamedTuple):
         return store_map(recipe, self.folder)
 
 
-def localise(made: StoredMap, recorded: Recorded) -> Localised:
-    """A session in a map, with `backend: localise`; poses are those given at each step.
-
-    Raises:
-        InputError: the session is not one of the map's sensor.
-    """
-    session = _session_in(made.path, capacity_for(recorded.log.length))
-    session.restart(recorded.config.session.seed)
-    return follow(session, (observation_of(sample) for sample in recorded.log))
-
-
 def follow(session: Session, observations: Iterable[Observation]) -> Localised:
     """What a session in a map says at each of its steps."""
     steps = list(session.replay(observations))
@@ -112,46 +82,6 @@ def follow(session: Session, observations: Iterable[Observation]) -> Localised:
     states = localiser.states()
     pose = np.array([step.pose for step in steps])
     return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
-
-
-def extend(made: StoredMap, recorded: Recorded) -> MapArrays:
-    """The map of a session and then another one, which begins a new piece of it.
-
-    Raises:
-        InputError: the session is not one of the map's sensor.
-    """
-    session = read_map(made.path).open_session()
-    session.begin_piece()
-    for _ in session.replay(observation_of(sample) for sample in recorded.log):
-        pass
-    return MapArrays.of_session(session, np.concatenate([made.arrays.truth, recorded.truth]))
-
-
-def merge(maps: Sequence[StoredMap], path: Path) -> StoredMap:
-    """One map of several, in a new folder; steps in the order of the arguments.
-
-    Raises:
-        InputError: the maps cannot be merged.
-    """
-    merged = merge_maps([made.path for made in maps], path)
-    begins = np.cumsum([0, *merged.steps[:-1]]).tolist()
-    begin = {at.parent: first for at, first in zip(merged.maps, begins, strict=True)}
-    order = np.concatenate([begin[made.path] + made.order for made in maps])
-    session = read_map(path).open_session()
-    truth = np.concatenate([made.arrays.truth for made in maps])
-    whole = MapArrays.of_session(session, truth)
-    arrays = whole._replace(trajectory=whole.trajectory[order], piece=whole.piece[order])
-    np.savez(path / STEPS, **arrays._asdict())
-    return StoredMap(path, arrays, order)
-
-
-def changes(made: StoredMap, recorded: Recorded) -> np.ndarray:
-    """Places [n, 2] of a map (m) where a session says that it no longer agrees, the surest first."""
-    localise(made, recorded)
-    localiser = _session_in(made.path, capacity_for(recorded.log.length)).map
-    assert isinstance(localiser, Localiser)
-    found = changes_of(localiser, recorded.config.touch)
-    return np.array([change.position for change in found]).reshape(-1, 2)
 
 
 @lru_cache(maxsize=1)
@@ -163,11 +93,58 @@ def _session_in(path: Path, reserve: int) -> Session:
     return build_session(config.model_copy(update={"session": rows}), saved.source)
 
 
-PRODUCT = Methods(localise, extend, merge, changes)
+class Methods:
+    """The operations of this program on saved maps; tests measure others."""
+
+    def localise(self, made: StoredMap, recorded: Recorded) -> Localised:
+        """A session in a map, with `backend: localise`; poses are those given at each step.
+
+        Raises:
+            InputError: the session is not one of the map's sensor.
+        """
+        session = _session_in(made.path, capacity_for(recorded.log.length))
+        session.restart(recorded.config.session.seed)
+        return follow(session, (observation_of(sample) for sample in recorded.log))
+
+    def extend(self, made: StoredMap, recorded: Recorded) -> MapArrays:
+        """The map of a session and then another one, which begins a new piece of it.
+
+        Raises:
+            InputError: the session is not one of the map's sensor.
+        """
+        session = read_map(made.path).open_session()
+        session.begin_piece()
+        for _ in session.replay(observation_of(sample) for sample in recorded.log):
+            pass
+        return MapArrays.of_session(session, np.concatenate([made.arrays.truth, recorded.truth]))
+
+    def merge(self, maps: Sequence[StoredMap], path: Path) -> StoredMap:
+        """One map of several, in a new folder; steps in the order of the arguments.
+
+        Raises:
+            InputError: the maps cannot be merged.
+        """
+        merged = merge_maps([made.path for made in maps], path)
+        begins = np.cumsum([0, *merged.steps[:-1]]).tolist()
+        begin = {at.parent: first for at, first in zip(merged.maps, begins, strict=True)}
+        order = np.concatenate([begin[made.path] + made.order for made in maps])
+        session = read_map(path).open_session()
+        truth = np.concatenate([made.arrays.truth for made in maps])
+        whole = MapArrays.of_session(session, truth)
+        arrays = whole._replace(trajectory=whole.trajectory[order], piece=whole.piece[order])
+        np.savez(path / STEPS, **arrays._asdict())
+        return StoredMap(path, arrays, order)
+
+    def changes(self, made: StoredMap, recorded: Recorded) -> np.ndarray:
+        """Places [n, 2] of a map (m) where a session says that it no longer agrees, the surest first."""
+        self.localise(made, recorded)
+        localiser = _session_in(made.path, capacity_for(recorded.log.length)).map
+        assert isinstance(localiser, Localiser)
+        found = changes_of(localiser, recorded.config.touch)
+        return np.array([change.position for change in found]).reshape(-1, 2)
 
 
 def reproduce_maps(
-    places: Mapping[str, str],
     names: Sequence[str],
     methods: Methods,
     output: Path,
@@ -180,17 +157,17 @@ def reproduce_maps(
     `maps.csv`, a session as soon as it is measured.
 
     Args:
-        places: of the figures by name. names: those to measure. output: folder for the page, and for the maps
-            in `maps`, which later calls use again. first: seed of the first maze; each session has the next
-            one. sessions: of each figure; None: the figure's own number. workers: processes. against: folder
-            of an earlier run; the same sessions are compared below the last table.
+        names: of the figures. output: folder for the page, and for the maps in `maps`, which later calls use
+            again. first: seed of the first maze; each session has the next one. sessions: of each figure;
+            None: the figure's own number. workers: processes. against: folder of an earlier run; the same
+            sessions are compared below the last table.
 
     Raises:
         InputError: a session cannot be recorded, or a file of the sessions cannot be used.
     """
     labels: dict[str, dict[int, str]] = {}  # of the sessions of each figure by seed, or number of a recording
     for name in names:
-        usual = find_figure(places[name]).sessions
+        usual = find_figure(MAPS[name]).sessions
         if isinstance(usual, int):
             labels[name] = {seed: str(seed) for seed in range(first, first + (sessions or usual))}
         else:
@@ -208,5 +185,5 @@ def reproduce_maps(
         named = ", ".join(used if len(used) < 3 else (used[0], "...", used[-1]))
         return [f"{len(tasks)} sessions: {named}.", ""], found
 
-    yield from write_page(output / "maps.md", places, names, measure)
+    yield from write_page(output / "maps.md", MAPS, names, measure)
     yield from compare_figures(log, names)

@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.metrics.statistics import wilson_interval
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.markdown import markdown_header
 from evaluation.plots import style
 from evaluation.plots.map_plot import draw_walls
 from robot.world.maze import Maze, wall_boxes
 from tactile.base.random_streams import stream
 
 
-def table(*rows: tuple[str, str, str, str]) -> list[str]:
-    """The lines of a table: a row has a figure, its goal, what was measured, and the same of the control."""
-    return [markdown_header(("figure", "goal", "measured", "control")), *map(markdown_row, rows)]
+def table(*rows: str) -> list[str]:
+    """The lines of a table: a row is `figure | goal | measured | the same of the control`."""
+    return [markdown_header(("figure", "goal", "measured", "control")), *(f"| {row} |" for row in rows)]
 
 
 def at_least(share: float, total: int) -> str:

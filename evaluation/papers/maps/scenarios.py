@@ -184,7 +184,7 @@ def _separate_parts(graph: networkx.Graph, random: np.random.Generator) -> _Part
     raise InputError("simulation.maze", f"{len(graph)} cells", "room for two separate parts")
 
 
-def wall_middle(a: Cell, b: Cell) -> np.ndarray:
+def _wall_middle(a: Cell, b: Cell) -> np.ndarray:
     """[2] middle of the wall between two neighbouring cells, m."""
     return (cell_centre(a) + cell_centre(b)) / 2
 
@@ -201,11 +201,6 @@ def _walls_beside(maze: Maze, loop: Sequence[Cell], there: bool) -> list[tuple[C
             if inside and not known and maze.is_open((x, y), b) != there:
                 pairs.append(((x, y), b))
     return pairs
-
-
-def cells_of(poses: np.ndarray) -> list[Cell]:
-    """The cell of each pose [T, 3]."""
-    return [(int(x), int(y)) for x, y in np.floor(poses[:, :2] / CELL_SIDE)]
 
 
 def open_world(maze: int) -> tuple[Maze, list[Cell]]:
@@ -268,7 +263,8 @@ def carried_sessions(maze: int) -> tuple[Recipe, Recipe, Recipe, int]:
     way = _enter(world, parts, random)
     config = _later(maze, "carried known", {"path": {"cells": way}})
     truth = record(Recipe(config)).truth
-    entry = next((step for step, cell in enumerate(cells_of(truth)) if cell in parts[0]), len(truth))
+    cells = map(tuple, np.floor(truth[:, :2] / CELL_SIDE).astype(int).tolist())
+    entry = next((step for step, cell in enumerate(cells) if cell in parts[0]), len(truth))
     path = {"explore": float(LOCALISED), "within": _turned(parts[1], random)}
     return (
         _explore_all(maze, world, "carried first", parts[0], PART),
@@ -292,14 +288,14 @@ def moved_wall(maze: int) -> tuple[Recipe, np.ndarray]:
         (wall, gap)
         for wall in walls
         for gap in gaps
-        if np.hypot(*(wall_middle(*wall) - wall_middle(*gap))) <= NEAR_WALL * CELL_SIDE
+        if np.hypot(*(_wall_middle(*wall) - _wall_middle(*gap))) <= NEAR_WALL * CELL_SIDE
     ]
     if not moves:
         raise InputError("simulation.maze", f"maze {maze} has no gap near a wall", "one beside the loop")
     wall, gap = moves[int(random.integers(len(moves)))]
     start = int(random.integers(len(loop)))
     settings = {"maze": {"added": [gap], "removed": [wall]}, "path": {"circuits": AFTER, "start": start}}
-    places = np.array([wall_middle(*wall), wall_middle(*gap)])
+    places = np.array([_wall_middle(*wall), _wall_middle(*gap)])
     return Recipe(_later(maze, "wall moved", settings)), places
 
 
@@ -313,7 +309,7 @@ def closed_door(maze: int) -> tuple[Recipe, np.ndarray]:
     start = int(random.integers(1, len(line) - 1))
     way = [*line[start:], *line[-2::-1], *line[1:], *line[-2:0:-1]]
     settings = {"maze": {"added": [(line[0], line[-1])]}, "path": {"cells": way}}
-    return Recipe(_later(maze, "door", settings)), wall_middle(line[0], line[-1])[None]
+    return Recipe(_later(maze, "door", settings)), _wall_middle(line[0], line[-1])[None]
 
 
 def kidnapped(maze: int) -> Recipe:

@@ -13,7 +13,6 @@ from evaluation.papers.cells.boxes import (
     correlate_shifts,
     fit_maps,
     lay_on_torus,
-    mean_correlation,
     measure_boxes,
 )
 from evaluation.papers.cells.rat_sessions import EVERY, choose_columns, column_activity, rat_config
@@ -53,7 +52,7 @@ def test_a_common_turn_and_shift_is_found_and_undone(degrees, x, y):
     assert abs(np.degrees(angle) - degrees) <= 15
     off = (np.array(shift) - [x, y] + BINS // 2) % BINS - BINS // 2
     assert np.abs(off).max() <= 1
-    assert mean_correlation(correlation) > 0.95
+    assert np.nanmean(correlation) > 0.95
 
 
 def test_correlations_of_shifts_are_those_of_numpy():
@@ -72,7 +71,6 @@ def test_correlations_of_shifts_are_those_of_numpy():
 def test_a_flat_map_has_no_correlation():
     found = correlate_shifts(np.ones((1, 7, 7)), np.random.default_rng(2).random((1, 7, 7)))
     assert np.isnan(found).all()
-    assert np.isnan(mean_correlation(found[:, 0, 0]))
 
 
 def test_laying_keeps_the_bins_of_a_box_that_is_not_turned():
@@ -84,10 +82,10 @@ def test_laying_keeps_the_bins_of_a_box_that_is_not_turned():
 
 def test_shuffled_identities_are_far_below_the_cells_themselves():
     fits, _, _ = fit_maps(fields(0.0, (0, 0)), fields(np.radians(75), (4, 17)), BINS)
-    assert mean_correlation(fits["best"]) > 0.95
-    assert abs(mean_correlation(fits["still"])) < 0.25
-    assert abs(mean_correlation(fits["shuffled still"])) < 0.25
-    assert mean_correlation(fits["shuffled best"]) < 0.35
+    assert np.nanmean(fits["best"]) > 0.95
+    assert abs(np.nanmean(fits["still"])) < 0.25
+    assert abs(np.nanmean(fits["shuffled still"])) < 0.25
+    assert np.nanmean(fits["shuffled best"]) < 0.35
 
 
 def test_columns_are_places_with_headings_all_the_way_round():

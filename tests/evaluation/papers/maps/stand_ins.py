@@ -24,48 +24,50 @@ def true_pose(made: StoredMap, truth: np.ndarray) -> np.ndarray:
     return compose(steps.pose[near], between(steps.truth[near], truth))
 
 
-def localise(made: StoredMap, recorded: Recorded) -> Localised:
-    """Found after `FOUND_AFTER` steps at the true pose if the images are those of the place, else never."""
-    known = "+" not in recorded.log.digest
-    steps = np.arange(recorded.log.length)
-    found = known & (steps >= FOUND_AFTER)
-    return Localised(found, ~found & (steps > 100), true_pose(made, recorded.truth))
+class Oracle(Methods):
+    """Knows the truth."""
+
+    def localise(self, made: StoredMap, recorded: Recorded) -> Localised:
+        """Found after `FOUND_AFTER` steps at the true pose if images are those of the place, else never."""
+        known = "+" not in recorded.log.digest
+        steps = np.arange(recorded.log.length)
+        found = known & (steps >= FOUND_AFTER)
+        return Localised(found, ~found & (steps > 100), true_pose(made, recorded.truth))
+
+    def extend(self, made: StoredMap, recorded: Recorded) -> MapArrays:
+        """Tied on at the true pose, unless the images are in random order."""
+        return _joined(made, recorded.truth, true_pose(made, recorded.truth), "+" not in recorded.log.digest)
+
+    def merge(self, maps: Sequence[StoredMap], path: Path) -> StoredMap:
+        """The second map at its true place in the first, without a common keyframe more."""
+        one, other = maps
+        return _stored(path, _joined(one, other.arrays.truth, true_pose(one, other.arrays.truth), True))
+
+    def changes(self, made: StoredMap, recorded: Recorded) -> np.ndarray:
+        """Where the session is at its step 50, in the map; nowhere in an unchanged maze."""
+        simulation = recorded.config.simulation
+        assert simulation is not None
+        return true_pose(made, recorded.truth[[50]])[:, :2] if simulation.maze.added else np.zeros((0, 2))
 
 
-def localise_wrongly(made: StoredMap, recorded: Recorded) -> Localised:
-    """Found at once, two cells off."""
-    found = np.ones(recorded.log.length, bool)
-    return Localised(found, ~found, true_pose(made, recorded.truth) + [2 * CELL_SIDE, 0, 0])
+class Wrong(Oracle):
+    """Sure and wrong, two cells off; joins everything."""
+
+    def localise(self, made: StoredMap, recorded: Recorded) -> Localised:
+        found = np.ones(recorded.log.length, bool)
+        return Localised(found, ~found, true_pose(made, recorded.truth) + [2 * CELL_SIDE, 0, 0])
+
+    def extend(self, made: StoredMap, recorded: Recorded) -> MapArrays:
+        pose = true_pose(made, recorded.truth) + [2 * CELL_SIDE, 0, 0]
+        return _joined(made, recorded.truth, pose, True)
 
 
-def extend(made: StoredMap, recorded: Recorded) -> MapArrays:
-    """Tied on at the true pose, unless the images are in random order."""
-    return _joined(made, recorded.truth, true_pose(made, recorded.truth), "+" not in recorded.log.digest)
+class Apart(Oracle):
+    """Joins nothing: two pieces."""
 
-
-def extend_wrongly(made: StoredMap, recorded: Recorded) -> MapArrays:
-    """Tied on two cells off."""
-    return _joined(made, recorded.truth, true_pose(made, recorded.truth) + [2 * CELL_SIDE, 0, 0], True)
-
-
-def merge(maps: Sequence[StoredMap], path: Path) -> StoredMap:
-    """The second map at its true place in the first, without a common keyframe more."""
-    one, other = maps
-    arrays = _joined(one, other.arrays.truth, true_pose(one, other.arrays.truth), True)
-    return _stored(path, arrays)
-
-
-def keep_apart(maps: Sequence[StoredMap], path: Path) -> StoredMap:
-    """Two pieces."""
-    one, other = maps
-    return _stored(path, _joined(one, other.arrays.truth, other.arrays.trajectory, False))
-
-
-def changes(made: StoredMap, recorded: Recorded) -> np.ndarray:
-    """Where the session is at its step 50, in the map; nowhere in an unchanged maze."""
-    simulation = recorded.config.simulation
-    assert simulation is not None
-    return true_pose(made, recorded.truth[[50]])[:, :2] if simulation.maze.added else np.zeros((0, 2))
+    def merge(self, maps: Sequence[StoredMap], path: Path) -> StoredMap:
+        one, other = maps
+        return _stored(path, _joined(one, other.arrays.truth, other.arrays.trajectory, False))
 
 
 def _stored(path: Path, arrays: MapArrays) -> StoredMap:
@@ -83,11 +85,7 @@ def _joined(made: StoredMap, truth: np.ndarray, pose: np.ndarray, joined: bool) 
     )
 
 
-ORACLE = Methods(localise, extend, merge, changes)
-WRONG = Methods(localise_wrongly, extend_wrongly, merge, changes)
-"""Sure and wrong; joins everything."""
-APART = ORACLE._replace(merge=keep_apart)
-"""Joins nothing."""
+ORACLE, WRONG, APART = Oracle(), Wrong(), Apart()
 
 
 def cells_by_figure(lines: Iterable[str]) -> dict[str, tuple[str, str]]:

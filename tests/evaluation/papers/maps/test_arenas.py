@@ -14,7 +14,7 @@ from tests.helpers.grid_world import report
 def judged(found_at: int, error: float) -> Judged:
     found = np.arange(REPORTS) >= found_at
     errors = np.column_stack([np.full(REPORTS, error), np.zeros(REPORTS)])
-    return Judged(found, ~found, found & (error <= 0.09), found & (error > 0.18), errors, errors)
+    return Judged(found, ~found, found & (error <= 0.09), found & (error > 0.18), errors)
 
 
 def figures(found_at: int, error: float, other_at: int) -> Measured:

@@ -22,7 +22,7 @@ MAZE = 31002
 
 def drive(state: DriveState, error: float, replans: int = 0) -> Drive:
     path = np.array([[0.09, 0.09], [0.27, 0.09]])
-    return Drive(state, "", path[1], 9, replans, error, 0.5, 0.01, 0.2, 0.18, 0.08, True, path)
+    return Drive(state, path[1], replans, error, 0.5, 0.01, 0.2, 0.18, 0.08, True, path)
 
 
 def test_the_shortest_way_runs_along_the_lines_between_cells():
@@ -64,7 +64,7 @@ def test_the_arm_drives_to_a_goal_on_its_map(tmp_path: Path):
     far = {place: loop.way_to(place)[0] for place in loop.experiences}
     goal = min(far, key=lambda place: abs(far[place] - 0.4))
     end = loop.drive(goal)
-    assert end.reached, (end.state, end.reason, end.error)
+    assert end.reached, (end.state, end.error)
     assert end.clear
     assert end.length <= 1.15 * end.shortest + 0.09
     walls = loop.walls().walls

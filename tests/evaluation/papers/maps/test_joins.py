@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.papers.maps.merged_maps import judge_join
+from evaluation.papers.maps.merged_maps import Join
 from evaluation.papers.maps.stored_maps import MapArrays
 
 COUNT = 20
@@ -33,23 +33,23 @@ def two_sessions(shift: float, turn: float = 0.0, joined: bool = True) -> MapArr
     ],
 )
 def test_a_join_is_right_or_wrong_and_none_is_neither(arrays: MapArrays, right: bool, wrong: bool) -> None:
-    found = judge_join(arrays, COUNT)
+    found = Join.of(arrays, COUNT)
     assert (found.right, found.wrong) == (right, wrong)
 
 
 def test_steps_before_the_known_part_do_not_count() -> None:
     arrays = two_sessions(0.0)
     arrays.trajectory[COUNT : COUNT + 12, 1] += 1
-    assert judge_join(arrays, COUNT).wrong
-    assert judge_join(arrays, COUNT, entry=12).right
+    assert Join.of(arrays, COUNT).wrong
+    assert Join.of(arrays, COUNT, entry=12).right
 
 
 def test_revisits_alone_are_compared() -> None:
     arrays = two_sessions(0.0)
     away = slice(COUNT, COUNT + 12)
     arrays.truth[away, 1] += 5
-    assert judge_join(arrays, COUNT).wrong
-    assert judge_join(arrays, COUNT, revisits=True).right
+    assert Join.of(arrays, COUNT).wrong
+    assert Join.of(arrays, COUNT, revisits=True).right
 
 
 def test_the_figures_of_a_map_are_those_of_its_known_steps() -> None:

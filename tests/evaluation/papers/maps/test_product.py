@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.maps import operations
+from evaluation.papers.maps.operations import Methods
 from evaluation.papers.maps.scenarios import Recipe, touch_config
 from evaluation.papers.maps.stored_maps import store_map
 from tests.ratslam.runs.touch_walks import SMALL
@@ -28,7 +28,7 @@ def test_each_further_session_joins_the_merged_map(later_first: bool, tmp_path: 
     worst = max(one.arrays.em for one in (merged, *others))
     for number, one in enumerate(others):
         maps = [one, merged] if later_first else [merged, one]
-        merged = operations.merge(maps, tmp_path / f"merged {number}")
+        merged = Methods().merge(maps, tmp_path / f"merged {number}")
         assert not merged.arrays.piece.any()
         np.testing.assert_array_equal(merged.arrays.truth, np.concatenate([m.arrays.truth for m in maps]))
         assert merged.arrays.em < 1.5 * worst

@@ -11,9 +11,10 @@ import pytest
 from evaluation.papers.figure import MAPS, find_figure
 from evaluation.papers.maps import merged_maps
 from evaluation.papers.maps import merged_maps as merging
-from evaluation.papers.maps.operations import MapTask, Methods, reproduce_maps
+from evaluation.papers.maps.operations import Localised, MapTask, Methods, reproduce_maps
 from evaluation.papers.maps.scenarios import (
     Recipe,
+    Recorded,
     carried_sessions,
     kidnapped,
     overlapping_sessions,
@@ -21,10 +22,10 @@ from evaluation.papers.maps.scenarios import (
     same_maze,
     ten_circuits,
 )
-from evaluation.papers.maps.stored_maps import STEPS, MapArrays, map_path
+from evaluation.papers.maps.stored_maps import STEPS, MapArrays, StoredMap, map_path
 from evaluation.papers.tables.comparison import read_sessions
 from tactile.base.se2 import compose
-from tests.evaluation.papers.maps.stand_ins import APART, ORACLE, WRONG, cells_by_figure
+from tests.evaluation.papers.maps.stand_ins import APART, ORACLE, WRONG, Oracle, cells_by_figure
 
 MAZE = 31000
 MOTION = np.array([1.0, -0.5, 0.7])
@@ -88,13 +89,13 @@ def test_shuffled_images_find_nothing_with_a_method_that_looks(maps: Path) -> No
 def test_what_is_found_in_another_maze_is_counted(maps: Path) -> None:
     found = measured("other maze", ORACLE, maps)  # this stand-in believes to be in every maze
     assert found["found in another maze, 300 whisks"] == ["1 of 1", "1 of 1"]
-    never = ORACLE._replace(localise=lambda made, recorded: _never(ORACLE, made, recorded))
-    assert measured("other maze", never, maps)["found in another maze, 300 whisks"][0] == "0 of 1"
+    assert measured("other maze", Never(), maps)["found in another maze, 300 whisks"][0] == "0 of 1"
 
 
-def _never(methods: Methods, made, recorded):  # type: ignore[no-untyped-def]
-    localised = methods.localise(made, recorded)
-    return localised._replace(found=np.zeros_like(localised.found))
+class Never(Oracle):
+    def localise(self, made: StoredMap, recorded: Recorded) -> Localised:
+        localised = super().localise(made, recorded)
+        return localised._replace(found=np.zeros_like(localised.found))
 
 
 def test_a_merged_map_is_compared_with_one_session_over_both(maps: Path) -> None:
@@ -121,9 +122,13 @@ def test_frames_of_many_sessions_are_those_of_the_merged_map(maps: Path, monkeyp
 
 def test_a_place_named_in_an_unchanged_maze_is_a_false_alarm(maps: Path) -> None:
     figure = "surest place named within a cell of the change"
-    alarm = ORACLE._replace(changes=lambda made, recorded: made.arrays.trajectory[:2, :2])
+
+    class Alarm(Oracle):
+        def changes(self, made: StoredMap, recorded: Recorded) -> np.ndarray:
+            return made.arrays.trajectory[:2, :2]
+
     assert measured("door closed", ORACLE, maps)[figure][1] == "0 of 1"
-    assert measured("door closed", alarm, maps)[figure][1] == "1 of 1"
+    assert measured("door closed", Alarm(), maps)[figure][1] == "1 of 1"
 
 
 def test_a_recording_is_split_into_two_halves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,7 +148,7 @@ def test_a_recording_is_split_into_two_halves(tmp_path: Path, monkeypatch: pytes
 def test_the_page_has_a_table_and_a_picture_per_row(maps: Path, tmp_path: Path) -> None:
     (tmp_path / "maps").symlink_to(maps)
     names = ["start", "carried", "kidnaps", "merge", "door closed"]
-    text = "\n".join(reproduce_maps(MAPS, names, ORACLE, tmp_path, MAZE, 1))
+    text = "\n".join(reproduce_maps(names, ORACLE, tmp_path, MAZE, 1))
     page = (tmp_path / "maps.md").read_text(encoding="utf-8")
     for name in names:
         picture = f"{name.replace(' ', '_')}.png"
@@ -195,11 +200,9 @@ def test_two_runs_of_saved_maps_are_compared_by_figure(maps: Path, tmp_path: Pat
     for folder in (tmp_path / "old", tmp_path / "new"):
         folder.mkdir()
         (folder / "maps").symlink_to(maps)
-    list(reproduce_maps(MAPS, ["start", "wall moved"], ORACLE, tmp_path / "old", MAZE, 1))
+    list(reproduce_maps(["start", "wall moved"], ORACLE, tmp_path / "old", MAZE, 1))
     lines = list(
-        reproduce_maps(
-            MAPS, ["start", "wall moved"], WRONG, tmp_path / "new", MAZE, 1, against=tmp_path / "old"
-        )
+        reproduce_maps(["start", "wall moved"], WRONG, tmp_path / "new", MAZE, 1, against=tmp_path / "old")
     )
     assert "| start | missed | 1 | 0 | 1 | - | 0, 1 (1) |" in lines
     assert "| start | whisks | 1 | 11.000 | inf | inf [-] | - |" in lines

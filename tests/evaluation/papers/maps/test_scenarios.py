@@ -13,7 +13,6 @@ from evaluation.papers.maps.scenarios import (
     REENTERED,
     Recipe,
     carried_sessions,
-    cells_of,
     closed_door,
     moved_wall,
     open_world,
@@ -22,13 +21,16 @@ from evaluation.papers.maps.scenarios import (
     same_maze,
     ten_circuits,
     unknown_start,
-    wall_middle,
 )
 from ratslam.runs.settings.run_config import RunConfig
-from robot.world.maze import CELL_SIDE, Maze
+from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre
 from robot.world.scene import make_maze
 
 MAZES = (31003, 31015)
+
+
+def cells_of(poses: np.ndarray) -> list[Cell]:
+    return [(int(x), int(y)) for x, y in np.floor(poses[:, :2] / CELL_SIDE)]
 
 
 def maze_of(config: RunConfig) -> Maze:
@@ -132,7 +134,7 @@ def test_a_closed_door_is_driven_up_to_from_both_sides() -> None:
     sides = [
         pair
         for pair in zip(loop, loop[1:] + loop[:1], strict=True)
-        if np.allclose(wall_middle(*pair), places[0])
+        if np.allclose((cell_centre(pair[0]) + cell_centre(pair[1])) / 2, places[0])
     ]
     assert len(sides) == 1
     assert set(sides[0]) <= set(cells_of(record(after).truth))
