@@ -74,6 +74,12 @@ def _predict_constant(
     return share * cells.used, jnp.zeros_like(share)
 
 
+@cache
+def _order(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    """A permutation of the cells of a network."""
+    return stream(seed, f"cells.permuted.{'x'.join(map(str, shape))}").permutation(int(np.prod(shape)))
+
+
 def _permuted_together(seed: int) -> Functions:
     """Cells change places, and all that is tied to them goes with them: a network of other names."""
     tie, excite = pose_cells.tie, pose_cells.excite
@@ -99,11 +105,6 @@ def _after_views(change: Callable[[Array, ViewCells], Array]) -> Functions:
         return belief._replace(activity=change(belief.activity, cells))
 
     return {"anchor": anchor_changed}
-
-
-def _permuted_cells(seed: int) -> Functions:
-    """The activities of all cells change places after every view."""
-    return _after_views(lambda sheet, _: sheet.reshape(-1)[_order(seed, sheet.shape)].reshape(sheet.shape))
 
 
 def _permuted_ties(seed: int) -> Functions:
@@ -153,7 +154,9 @@ LESIONS: dict[str, Callable[[int], Functions]] = {
     INTACT: lambda seed: {},
     "prediction constant": lambda seed: {"predict": _predict_constant},
     "cells and ties permuted together": _permuted_together,
-    "cells permuted alone": _permuted_cells,
+    "cells permuted alone": lambda seed: _after_views(
+        lambda sheet, _: sheet.reshape(-1)[_order(seed, sheet.shape)].reshape(sheet.shape)
+    ),
     "ties permuted alone": _permuted_ties,
     # Odometry moves no cell.
     "no path integration": lambda seed: {"integrate_path": lambda cells, motion: cells},
@@ -229,12 +232,6 @@ def _record_activity(task: TouchTask) -> np.ndarray:
         if (k + 1) % EVERY == 0:
             recorded.append(np.array(session.state.belief.activity))
     return np.stack([one for one in recorded if one.shape == recorded[-1].shape])
-
-
-@cache
-def _order(seed: int, shape: tuple[int, ...]) -> np.ndarray:
-    """A permutation of the cells of a network."""
-    return stream(seed, f"cells.permuted.{'x'.join(map(str, shape))}").permutation(int(np.prod(shape)))
 
 
 def _lesions_and_rows(result: _Lesions) -> tuple[list[str], list[str]]:

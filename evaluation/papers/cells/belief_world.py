@@ -125,16 +125,15 @@ def random_world(seed: int, updates: int) -> World:
     return World(poses, motion, likelihood, novelty, truth, np.zeros(len(poses)))
 
 
-def exact(world: World, cell: float = 0.0, enter: float = CONFIG.enter) -> np.ndarray:
+def exact(world: World, cell: float = 0.0) -> np.ndarray:
     """[T, N + 1] exact inference on a histogram over x, y and heading.
 
     Args:
-        cell: side of its cells, in those of the network along each axis; 0: infinitely small. enter: see
-            `RecallConfig`.
+        cell: side of its cells, in those of the network along each axis; 0: infinitely small.
     """
-    state, rows = _start(world), []
+    state, rows = np.append(world.start, 1 - world.start.sum()), []
     for k in range(len(world.motion)):
-        state = _update(world, k, state, cell, enter)
+        state = _update(world, k, state, cell)
         rows.append(state)
     return np.array(rows)
 
@@ -142,11 +141,12 @@ def exact(world: World, cell: float = 0.0, enter: float = CONFIG.enter) -> np.nd
 def particles(world: World, seed: int, count: int = PARTICLES) -> np.ndarray:
     """[T, N + 1] the same by particles, which are drawn anew after each update, one in each of `count` equal
     shares of the mixture of their weighed predictions."""
-    random, state, rows = stream(seed, "cells.belief_particles"), _start(world), []
+    random, state = stream(seed, "cells.belief_particles"), np.append(world.start, 1 - world.start.sum())
+    rows = []
     for k in range(len(world.motion)):
         drawn = np.searchsorted(np.cumsum(state), (np.arange(count) + random.random()) / count)
         held = np.bincount(np.minimum(drawn, len(state) - 1), minlength=len(state)) / count
-        state = _update(world, k, held, 0.0, CONFIG.enter)
+        state = _update(world, k, held, 0.0)
         rows.append(state)
     return np.array(rows)
 
@@ -263,14 +263,10 @@ def _compiled(
     return jax.jit(run)
 
 
-def _start(world: World) -> np.ndarray:
-    return np.append(world.start, 1 - world.start.sum())
-
-
-def _update(world: World, k: int, state: np.ndarray, cell: float, enter: float) -> np.ndarray:
-    """[N + 1] probabilities after update k. cell, enter: see `exact`."""
+def _update(world: World, k: int, state: np.ndarray, cell: float) -> np.ndarray:
+    """[N + 1] probabilities after update k. cell: see `exact`."""
     table = _table(world.poses.tobytes(), world.motion[k].tobytes(), cell)
-    moved, entered = table @ state[:-1], state[-1] * enter
+    moved, entered = table @ state[:-1], state[-1] * CONFIG.enter
     new = 1 - moved.sum() - entered
     known = world.likelihood[k] * (moved + entered / len(moved))
     weighed = np.append(known, world.novelty[k] * max(new, 0.0))

@@ -8,7 +8,6 @@ maps of all cells are therefore compared as they are and after the best turn and
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from scipy import fft
 from evaluation.cells.rate_map import bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
 from evaluation.papers.cells.panels import name_panel, panel_row, table_lines
-from evaluation.papers.cells.rat_sessions import RatSessions, choose_columns, column_activity, rat_config
+from evaluation.papers.cells.rat_sessions import RatSessions, column_activity
 from evaluation.papers.figure import Figure, Task
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
@@ -150,21 +149,16 @@ def measure_boxes(task: Task, seconds: float = SECONDS, columns: int = COLUMNS) 
         seconds: in A, in A again, and in B. columns: places on the torus.
     """
     prepare_precision("float64")
-    config = rat_config(f"rat_simulation.rate_hz={RATE}")
-    network = config.pose_cells
-    chosen = choose_columns(network, columns, task.first)
-    config = rat_config(
-        f"rat_simulation.rate_hz={RATE}",
-        "rat_simulation.views.every=1",
-        f"cells={{chosen: {json.dumps(chosen)}}}",
+    rats = RatSessions.of_columns(
+        columns, task.first, f"rat_simulation.rate_hz={RATE}", "rat_simulation.views.every=1"
     )
     phase: dict[str, Any] = {"start": 2 * seconds, "kidnap": PLACE, "box": BOX}
-    rats, sessions = RatSessions(config), []
+    sessions = []
     for seed in task.seeds(USUAL):
         source = rats.rat(seed, walk={}, seconds=3 * seconds, phases=[phase])
         side = source.config.box.width
         sessions.append(_fit_session(rats.run(source), seconds, side, columns))
-    return sessions, side, network.cells_xy * network.cell_size
+    return sessions, side, rats.torus
 
 
 def _fit_session(recording: CellRecording, seconds: float, side: float, columns: int) -> _Session:

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import json
+from typing import Any, Literal, Self
 
 import numpy as np
 
 from evaluation.cells.recording import CellRecording
 from ratslam.core.session import Session
-from ratslam.network.config import PoseCellConfig
 from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.cell_recorder import CellSums, plan_recording
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
 from robot.sources.source import Source
-from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
 PACKAGED = "rat_box"
 """The packaged configuration that the sessions begin with: a box of 1 m, RatSLAM as published."""
+
+
+EVERY = 3
+"""Every third heading of a column is recorded: the packet is wider than the gap."""
 
 
 class RatSessions:
@@ -31,6 +34,21 @@ class RatSessions:
     def __init__(self, config: RunConfig) -> None:
         self.config = config
         self._session: Session | None = None
+
+    @classmethod
+    def of_columns(cls, columns: int, seed: int, *assignments: str) -> Self:
+        """Sessions that record so many columns, drawn without repeats; each is the cells of one place on the
+        torus. assignments: see `rat_config`."""
+        cells = rat_config().pose_cells
+        side, headings = cells.cells_xy, range(0, cells.cells_heading, EVERY)
+        drawn = stream(seed, "cells.columns").permutation(side * side)[:columns].tolist()
+        chosen = [[at % side, at // side, heading] for at in drawn for heading in headings]
+        return cls(rat_config(f"cells={{chosen: {json.dumps(chosen)}}}", *assignments))
+
+    @property
+    def torus(self) -> float:
+        """Side of the torus of the pose cells, m."""
+        return self.config.pose_cells.cells_xy * self.config.pose_cells.cell_size
 
     def rat(self, seed: int, **changed: Any) -> RatSimulation:
         """The rat of the configuration with another seed and with settings of `RatSimulationConfig` replaced.
@@ -47,14 +65,13 @@ class RatSessions:
         """The recorded cells of T steps of a session over a source, from the start.
 
         Raises:
-            InputError: no cells are to be recorded, or see `plan_recording`.
+            InputError: see `plan_recording`.
         """
         if self._session is None:
             self._session = build_session(self.config, source)
         self._session.restart(self.config.session.seed)
         plan = plan_recording(self.config, source, self._session.backend)
-        if plan is None:
-            raise InputError("cells", "null", "a section", "`cells: {chosen: 0}` records packets alone")
+        assert plan is not None
         rows = list(read_observations(source))
         samples = [sample for sample, _ in rows]
         steps = list(self._session.replay([observation for _, observation in rows]))
@@ -107,19 +124,6 @@ def record_rat(
         recording = RatSessions(config).run(source)
     kept = np.flatnonzero(recording.activity.any(axis=0))[:cells]
     return recording._replace(cell=recording.cell[kept], activity=recording.activity[:, kept])
-
-
-EVERY = 3
-"""Every third heading of a column is recorded: the packet is wider than the gap."""
-
-
-def choose_columns(config: PoseCellConfig, count: int, seed: int) -> list[list[int]]:
-    """Indices [x, y, heading] of the cells of `count` columns, drawn without repeats; a setting
-    `cells.chosen`. A column is the cells of one place on the torus."""
-    side = config.cells_xy
-    drawn = stream(seed, "cells.columns").permutation(side * side)[:count].tolist()
-    headings = range(0, config.cells_heading, EVERY)
-    return [[at % side, at // side, heading] for at in drawn for heading in headings]
 
 
 def column_activity(activity: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,6 @@ of the torus. The grid cells of the entorhinal cortex lie on a hexagonal one (Ha
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -28,7 +27,7 @@ from evaluation.cells.rate_map import place_index, sample_seconds, smooth_rates
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import PathBins, ShuffledScores, shuffled_scores
 from evaluation.papers.cells.panels import panel_row, table_lines
-from evaluation.papers.cells.rat_sessions import RatSessions, choose_columns, column_activity, rat_config
+from evaluation.papers.cells.rat_sessions import RatSessions, column_activity
 from evaluation.papers.figure import Figure, Task
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
@@ -83,10 +82,7 @@ def measure_torus(
         seconds: in the large and in the small box. columns: places on the torus. shuffles: of each.
     """
     prepare_precision("float64")
-    network = rat_config().pose_cells
-    chosen = choose_columns(network, columns, task.first)
-    config = rat_config(f"rat_simulation.rate_hz={RATE}", f"cells={{chosen: {json.dumps(chosen)}}}")
-    rats = RatSessions(config)
+    rats = RatSessions.of_columns(columns, task.first, f"rat_simulation.rate_hz={RATE}")
     recordings = [
         rats.run(
             rats.rat(
@@ -103,7 +99,7 @@ def measure_torus(
         measure(large, summed, LARGE, BINS[0]),
         measure(large, single, LARGE, BINS[0]),
         measure(small, column_activity(small.activity, columns)[0], SMALL, BINS[1]),
-        network.cells_xy * network.cell_size,
+        rats.torus,
     )
 
 

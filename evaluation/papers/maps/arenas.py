@@ -18,9 +18,8 @@ import numpy as np
 from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import RIGHT, WRONG, MapSteps
 from evaluation.papers.maps.localising import Judged
-from evaluation.papers.maps.operations import Localised, MapTask, Measured, column, follow
+from evaluation.papers.maps.operations import Localised, MapTask, Measured, column
 from evaluation.papers.maps.pictures import at_least, count, draw_panels, median, spread, table
-from evaluation.papers.maps.scenarios import draw_seed
 from evaluation.papers.trial_sessions import simulate_session
 from evaluation.studies.machine import code_digest
 from ratslam.runs.build_session import build_session, open_observations
@@ -52,7 +51,7 @@ def _measure_arena(task: MapTask, side: float = SMALL) -> Measured:
 
     def localise(observations: Sequence[Observation]) -> Localised:
         session.restart()
-        return follow(session, observations)
+        return Localised.by(session, observations)
 
     seen, truth, motion = _drive_elsewhere(task.seed, side)
     known = localise(seen)
@@ -154,7 +153,7 @@ def _arena_config(arena: int, side: float, seed: int) -> RunConfig:
 def _drive_elsewhere(arena: int, side: float) -> tuple[list[Observation], np.ndarray, np.ndarray]:
     """A further session in an arena, from another start: T observations, and the true poses and the motions
     by odometry [T, 3]."""
-    config = _arena_config(arena, side, draw_seed(arena, "arena start"))
+    config = _arena_config(arena, side, int(stream(arena, "atlas.arena start").integers(1 << 31)))
     assert config.create_simulation is not None
     session = simulate_session(config.create_simulation)
     touch = complete(config, session.source).touch

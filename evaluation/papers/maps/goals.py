@@ -269,7 +269,7 @@ class ClosedLoop:
             drive.state, place, drive.replans, error, reckoned, by_arm,
             float(np.hypot(*np.diff(path, axis=0).T).sum()),
             shortest_driven(self.scene.loop, path[0], place)[0],
-            clearance(walls.walls, path),
+            _clearance(walls.walls, path),
             not (walls.contact(poses).angle <= 0).any(),
             path,
         )  # fmt: skip
@@ -316,7 +316,7 @@ def shortest_driven(loop: Sequence[Cell], a: np.ndarray, b: np.ndarray) -> tuple
     return float(length), way[1:-1]
 
 
-def clearance(walls: Walls, path: np.ndarray) -> float:
+def _clearance(walls: Walls, path: np.ndarray) -> float:
     """Least distance of points of a path [N, 2 or 3] from the walls, in plan, m."""
     low, high = walls.box[:, :2], walls.box[:, 2:]
     place = path[:, None, :2]
@@ -332,24 +332,21 @@ def _measure_goals(task: MapTask) -> Measured:
     free = [loop.drive(loop.draw_goal(random)) for _ in range(PAIRS)]
     walled = [loop.drive_blocked(random) for _ in range(WALLS)]
     mapped = stored.arrays.steps.truth[:, :2]
-    return goal_figures(free, walled, loop.time, mapped, loop.scene.maze, loop.scene.surroundings.walls)
+    least = _clearance(loop.scene.surroundings.walls, mapped)
+    return goal_figures(free, walled, loop.time, mapped, least, loop.scene.maze)
 
 
 def goal_figures(
-    free: Sequence[Drive],
-    walled: Sequence[Drive],
-    seconds: float,
-    mapped: np.ndarray,
-    maze: Maze,
-    walls: Walls,
+    free: list[Drive], walled: list[Drive], seconds: float, mapped: np.ndarray, least: float, maze: Maze
 ) -> Measured:
     """The figures of the drives on one map: numbers of drives, and lengths in m.
 
     Args:
         free, walled: drives without and with a wall put in the way. seconds: duration of all, by the arm.
-            mapped: [n, 2] true path of the session that made the map, m, in a maze and its walls.
+            mapped: [n, 2] true path of the session that made the map, m. least: its least distance from a
+            wall, m.
     """
-    drives, done = [*free, *walled], [drive for drive in free if drive.said_reached]
+    drives, done = free + walled, [drive for drive in free if drive.said_reached]
     lengths = sum(drive.length for drive in done), sum(drive.shortest for drive in done)
     figures = {
         "not_reached": sum(not drive.reached for drive in free),
@@ -369,8 +366,7 @@ def goal_figures(
         {"map": mapped, "drives": driven},
         [("goals", np.array([drive.goal for drive in free]).reshape(-1, 2))],
     )
-    mapping = clearance(walls, mapped)
-    return Measured(figures, {"free": free, "walled": walled, "mapping": mapping, "paths": paths})
+    return Measured(figures, {"free": free, "walled": walled, "mapping": least, "paths": paths})
 
 
 def _goal_lines(found: Sequence[Measured]) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -38,6 +38,16 @@ class Localised(NamedTuple):
     found: np.ndarray
     foreign: np.ndarray
     pose: np.ndarray
+
+    @classmethod
+    def by(cls, session: Session, observations: Iterable[Observation]) -> Self:
+        """What a session in a map says at each of its steps."""
+        steps = list(session.replay(observations))
+        localiser = session.map
+        assert isinstance(localiser, Localiser | GridLocaliser)
+        states = localiser.states()
+        pose = np.array([step.pose for step in steps])
+        return cls(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
 
 
 class Measured(NamedTuple):
@@ -74,16 +84,6 @@ class MapTask(NamedTuple):
         return store_map(recipe, self.folder)
 
 
-def follow(session: Session, observations: Iterable[Observation]) -> Localised:
-    """What a session in a map says at each of its steps."""
-    steps = list(session.replay(observations))
-    localiser = session.map
-    assert isinstance(localiser, Localiser | GridLocaliser)
-    states = localiser.states()
-    pose = np.array([step.pose for step in steps])
-    return Localised(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
-
-
 @lru_cache(maxsize=1)
 def _session_in(path: Path, reserve: int) -> Session:
     """A session of any state in a map; the last one that was compiled is used again."""
@@ -104,7 +104,7 @@ class Methods:
         """
         session = _session_in(made.path, capacity_for(recorded.log.length))
         session.restart(recorded.config.session.seed)
-        return follow(session, (observation_of(sample) for sample in recorded.log))
+        return Localised.by(session, (observation_of(sample) for sample in recorded.log))
 
     def extend(self, made: StoredMap, recorded: Recorded) -> MapArrays:
         """The map of a session and then another one, which begins a new piece of it.

@@ -73,11 +73,6 @@ def record(recipe: Recipe) -> Recorded:
     return Recorded(config, cut_log(log, recipe.first, recipe.last))
 
 
-def draw_seed(maze: int, name: str) -> int:
-    """Seed of a further session of a maze; sessions of different names are independent."""
-    return int(stream(maze, f"atlas.{name}").integers(1 << 31))
-
-
 def touch_config(maze: int, seed: int, settings: dict[str, Any], keyframes: dict[str, Any]) -> RunConfig:
     """The configuration of a whisker session.
 
@@ -318,8 +313,9 @@ def kidnapped(maze: int) -> Recipe:
 
 
 def _later(maze: int, name: str, settings: dict[str, Any]) -> RunConfig:
-    """The configuration of a further session of the maze."""
-    return touch_config(maze, draw_seed(maze, name), MAIN | settings, {})
+    """The configuration of a further session of the maze; those of different names are independent."""
+    seed = int(stream(maze, f"atlas.{name}").integers(1 << 31))
+    return touch_config(maze, seed, MAIN | settings, {})
 
 
 def _explore_all(seed: int, maze: Maze, name: str, cells: tuple[Cell, ...], steps: int) -> Recipe:

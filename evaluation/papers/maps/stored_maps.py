@@ -82,10 +82,10 @@ class StoredMap(NamedTuple):
     arrays: MapArrays
     order: np.ndarray
 
-
-def map_path(recipe: Recipe, folder: Path) -> Path:
-    """Where in `folder` the map of a session by this code is."""
-    return folder / f"{recipe.digest[:16]}-{code_digest()}"
+    @staticmethod
+    def place(recipe: Recipe, folder: Path) -> Path:
+        """Where in `folder` the map of a session by this code is."""
+        return folder / f"{recipe.digest[:16]}-{code_digest()}"
 
 
 def store_map(recipe: Recipe, folder: Path) -> StoredMap:
@@ -94,7 +94,7 @@ def store_map(recipe: Recipe, folder: Path) -> StoredMap:
     Raises:
         InputError: the session cannot be recorded.
     """
-    path = map_path(recipe, folder)
+    path = StoredMap.place(recipe, folder)
     if not path.exists():
         _write_map(record(recipe), path)
     with np.load(path / STEPS) as saved:

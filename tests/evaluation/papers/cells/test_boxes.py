@@ -15,7 +15,7 @@ from evaluation.papers.cells.boxes import (
     lay_on_torus,
     measure_boxes,
 )
-from evaluation.papers.cells.rat_sessions import EVERY, choose_columns, column_activity, rat_config
+from evaluation.papers.cells.rat_sessions import EVERY, RatSessions, column_activity
 from evaluation.papers.figure import Task
 
 BINS = 21
@@ -89,11 +89,11 @@ def test_shuffled_identities_are_far_below_the_cells_themselves():
 
 
 def test_columns_are_places_with_headings_all_the_way_round():
-    config = rat_config().pose_cells
-    chosen = np.array(choose_columns(config, 5, 0)).reshape(5, -1, 3)
+    config = RatSessions.of_columns(5, 0).config
+    chosen = np.array(config.cells.chosen).reshape(5, -1, 3)
     assert (chosen[..., :2] == chosen[:, :1, :2]).all()
     assert len(np.unique(chosen[:, 0, :2], axis=0)) == 5
-    np.testing.assert_array_equal(chosen[0, :, 2], np.arange(0, config.cells_heading, EVERY))
+    np.testing.assert_array_equal(chosen[0, :, 2], np.arange(0, config.pose_cells.cells_heading, EVERY))
     activity = np.arange(2.0 * chosen.shape[0] * chosen.shape[1]).reshape(2, -1)
     summed, single = column_activity(activity, 5)
     assert summed.sum() == activity.sum()

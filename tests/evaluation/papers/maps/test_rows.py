@@ -22,7 +22,7 @@ from evaluation.papers.maps.scenarios import (
     same_maze,
     ten_circuits,
 )
-from evaluation.papers.maps.stored_maps import STEPS, MapArrays, StoredMap, map_path
+from evaluation.papers.maps.stored_maps import STEPS, MapArrays, StoredMap
 from evaluation.papers.tables.comparison import read_sessions
 from tactile.base.se2 import compose
 from tests.evaluation.papers.maps.stand_ins import APART, ORACLE, WRONG, Oracle, cells_by_figure
@@ -38,7 +38,7 @@ def plant(folder: Path, *recipes: Recipe) -> Path:
         truth = record(recipe).truth
         pose = np.where(np.isfinite(truth), compose(MOTION, np.nan_to_num(truth)), 0.0)
         arrays = MapArrays(pose, truth, np.zeros(len(truth), int), len(truth) // 2)
-        path = map_path(recipe, folder)
+        path = StoredMap.place(recipe, folder)
         path.mkdir(parents=True)
         np.savez(path / STEPS, **arrays._asdict())
     return folder

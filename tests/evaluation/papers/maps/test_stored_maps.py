@@ -9,13 +9,13 @@ import pytest
 
 from evaluation.papers.maps import arenas, stored_maps
 from evaluation.papers.maps.scenarios import unknown_start
-from evaluation.papers.maps.stored_maps import STEPS, MapArrays, map_path, store_map
+from evaluation.papers.maps.stored_maps import STEPS, MapArrays, StoredMap, store_map
 from ratslam.runs.saved_map import read_map
 
 
 def test_a_map_of_other_code_is_not_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe, poses = unknown_start(31000), np.zeros((5, 3))
-    path = map_path(recipe, tmp_path)
+    path = StoredMap.place(recipe, tmp_path)
     path.mkdir()
     np.savez(path / STEPS, **MapArrays(poses, poses, np.zeros(5, int), 2)._asdict())
     monkeypatch.setattr(stored_maps, "record", lambda _: pytest.fail("made again"))
