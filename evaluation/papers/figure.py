@@ -33,7 +33,7 @@ CELLS = {
 """Pose cells: the first nine are measured on `backend: classic`, the others on `backend: recall`."""
 REAL = {
     name: f"whiskers.{name}.FIGURE"
-    for name in ("contact", "drift", "fit", "tangent", "likeness", "walk", "create", "bumps")
+    for name in ("contact", "drift", "fit", "likeness", "walk", "create", "bumps")
 }
 """Recordings of real whiskers and wheels."""
 MAPS = {

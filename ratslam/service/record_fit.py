@@ -323,7 +323,7 @@ def _fit_stage(source: PluginConfig) -> Rig:
             known = fit_signal_map(position[~fold], signal[~fold], base)
             for out, mean in zip(
                 errors,
-                (known.predict(position[fold]), signal[~fold].mean(axis=0)),
+                (known(position[fold]), signal[~fold].mean(axis=0)),
                 strict=True,
             ):
                 out[fold] = np.sqrt(((signal[fold] - mean) ** 2).mean(axis=1))
