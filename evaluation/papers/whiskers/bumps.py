@@ -30,23 +30,18 @@ from tactile.base.se2 import between, compose, integrate
 from tactile.base.types import Observation
 
 
-class WallDistances(NamedTuple):
-    """Distances from the robot's true position to the nearest wall, m: [E] at the first reading of each
-    contact, and [T] at all readings."""
-
-    contact: np.ndarray
-    all: np.ndarray
-
-
-def wall_distances(position: np.ndarray, pressed: np.ndarray, walls: np.ndarray) -> WallDistances:
-    """The distances along a true path.
+def wall_distances(
+    position: np.ndarray, pressed: np.ndarray, walls: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances along a true path to the nearest wall, m: [E] at the first reading of each contact, and [T]
+    at all readings.
 
     Args:
         position: [T, 2], m. pressed: [T] bool, a bumper is pressed. walls: [W, 4] ends x1, y1, x2, y2, m.
     """
     distance = segment_distance(walls, position).min(axis=1)
     begins = pressed & ~np.concatenate([[False], pressed[:-1]])
-    return WallDistances(distance[begins], distance)
+    return distance[begins], distance
 
 
 CONFIG = Path("configs/create_bumps.yaml")
@@ -125,7 +120,7 @@ def _measure(folder: Path) -> BumpsResult:
     touching, known = np.array([each.contact.any() for each in observations]), _known(truth)
     return BumpsResult(
         final, online, _odometry_errors(observations, truth), (first, second),
-        wall_distances(truth[known, :2], touching[known], segments).contact,
+        wall_distances(truth[known, :2], touching[known], segments)[0],
         truth, _aligned(_dead_reckoning(observations), truth), _aligned(middle[2], truth),
         (middle[3], align(middle[2][known], truth[known])), segments,
     )  # fmt: skip

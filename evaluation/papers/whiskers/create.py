@@ -19,7 +19,7 @@ from evaluation.papers.tables.buildings import buildings_rows
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import metres
 from evaluation.papers.trial_sessions import RecordingRun, closure_claims, run_recording
-from evaluation.papers.whiskers.bumps import WallDistances, wall_distances
+from evaluation.papers.whiskers.bumps import wall_distances
 from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.plots.style import BLUE, GREY, INK, VERMILLION, add_axes, name_axes, new_figure
 from ratslam.mapping.keyframe_graph import KeyframeGraph
@@ -67,20 +67,6 @@ class Variant(NamedTuple):
     candidates: int
     right: int
     revisits: float
-
-
-def _run_variants(folder: Path) -> Iterator[tuple[str, RecordingRun]]:
-    """A session by the classic method, and those by keyframes: with half, once and twice the cell size and
-    sector width of the configuration.
-
-    Args:
-        folder: of the repository, which holds `configs`.
-    """
-    rows = {name: row for name, row in buildings_rows().items() if row.section == "create"}
-    default = rows[DEFAULT].recording
-    yield "classic", run_recording(default.configuration(folder, "backend=classic"))
-    for name, row in rows.items():
-        yield name, run_recording(row.configuration(folder))
 
 
 def _measure_variant(run: RecordingRun) -> Variant:
@@ -147,7 +133,7 @@ class CreateResult(NamedTuple):
     Attributes:
         variants: by name. true_turns: ATE of odometry with true turns, m. drift: range of
             odometry's heading error, rad. latency: median age of a depth reading, s. paths: [T, 3] poses
-            aligned with the truth, by name. walls: [W, 4] ends, m. distances: to the nearest wall.
+            aligned with the truth, by name. walls: [W, 4] ends, m. distances: of `wall_distances`.
     """
 
     variants: dict[str, Variant]
@@ -156,7 +142,7 @@ class CreateResult(NamedTuple):
     latency: float
     paths: dict[str, np.ndarray]
     walls: np.ndarray
-    distances: WallDistances
+    distances: tuple[np.ndarray, np.ndarray]
 
 
 def _measure_create(folder: Path) -> CreateResult:
@@ -171,8 +157,12 @@ def _measure_create(folder: Path) -> CreateResult:
     segments = np.stack([walls[name] for name in ("x1", "y1", "x2", "y2")], axis=1)
     pressed = np.any([bumps[name] > 0 for name in BUMPERS], axis=0)
     distances = wall_distances(np.stack([seen["x"], seen["y"]], axis=1), pressed, segments)
+    # By the classic method, and by keyframes: with half, once and twice the cell size and sector width.
+    rows = {name: row for name, row in buildings_rows().items() if row.section == "create"}
+    configs = {"classic": rows[DEFAULT].recording.configuration(Path(), "backend=classic")}
     variants = {}
-    for name, run in _run_variants(Path()):
+    for name, config in (configs | {name: row.configuration(Path()) for name, row in rows.items()}).items():
+        run = run_recording(config)
         variants[name] = _measure_variant(run)
         if name == DEFAULT:
             default = run
@@ -247,12 +237,10 @@ def _summary(result: CreateResult) -> str:
     )
 
 
-def _wall_table(distances: WallDistances) -> list[str]:
+def _wall_table(distances: tuple[np.ndarray, np.ndarray]) -> list[str]:
     rows = [markdown_header(("robot to the nearest wall, m", "number", *(f"{p} %" for p in PERCENTILES)))]
-    for name, values in (
-        ("at the first reading of a contact", distances.contact),
-        ("at all readings (control)", distances.all),
-    ):
+    names = "at the first reading of a contact", "at all readings (control)"
+    for name, values in zip(names, distances, strict=True):
         spread = np.percentile(values, PERCENTILES)
         rows.append(markdown_row([name, str(len(values)), *(f"{value:.3f}" for value in spread)]))
     return rows
@@ -278,9 +266,10 @@ def _draw_create(result: CreateResult, png: Path) -> None:
     name_axes(room, "x (m)", "y (m)")
     below = add_axes(figure, 0.62, 0.55, 7.0, 1.8)
     bins = np.arange(0.1, 0.8, 0.01)
+    contact, every = result.distances
     for values, colour, label in (
-        (result.distances.all, GREY, "all readings"),
-        (result.distances.contact, VERMILLION, "first reading of a contact"),
+        (every, GREY, "all readings"),
+        (contact, VERMILLION, "first reading of a contact"),
     ):
         weights = np.full(len(values), 1 / len(values))
         below.hist(values, bins.tolist(), weights=weights, color=colour, alpha=0.8, label=label)

@@ -94,26 +94,20 @@ def _measure(folder: Path) -> list[_WalkResult]:
         for maze in mazes
     ]
     logs = [open_walk(walk) for walk in walks]
-    given = RunConfig.model_validate({"source": {"plugin": "whisker_walk"}})
-    recorded = [run_session(complete(given, log), log) for log in logs]
-    sessions = [collect_session(whisker_config(maze)) for maze in mazes]
+    source = RunConfig.model_validate({"source": {"plugin": "whisker_walk"}})
+    recorded = [run_session(complete(source, log), log) for log in logs]
+    given = [{"simulation": walk_simulation(maze).model_dump(exclude_unset=True)} for maze in mazes]
+    sessions = [collect_session(RunConfig.model_validate(parts)) for parts in given]
     simulated = [run_session(*session) for session in sessions]
-    one_way = [run_session(compare_one_way(config), log) for config, log in sessions]
+    # Views are compared only as seen in the same direction.
+    one_way = []
+    for config, log in sessions:
+        recall = config.recall.model_copy(update={"shifts": 0})
+        one_way.append(run_session(config.model_copy(update={"recall": recall}), log))
     real, shuffled = recorded[: len(mazes)], recorded[len(mazes) :]
     ends = [_continue_walk(*row) for row in zip(mazes, real, logs[: len(mazes)], strict=True)]
     rows = zip(mazes, real, shuffled, simulated, one_way, strict=True)
     return [_WalkResult(*row, *end) for row, end in zip(rows, ends, strict=True)]
-
-
-def whisker_config(maze: int) -> RunConfig:
-    """The session in a maze with simulated whiskers."""
-    simulation = walk_simulation(maze).model_dump(exclude_unset=True)
-    return RunConfig.model_validate({"simulation": simulation})
-
-
-def compare_one_way(config: RunConfig) -> RunConfig:
-    """The configuration with views compared only as seen in the same direction."""
-    return config.model_copy(update={"recall": config.recall.model_copy(update={"shifts": 0})})
 
 
 def _continue_walk(
