@@ -174,15 +174,13 @@ def _figure(arguments: argparse.Namespace) -> int:
 
 def _threshold(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
-    from evaluation.papers.salman2016.threshold_tuning import render_tuning, save_tuning, tune_threshold
+    from evaluation.papers.salman2016.threshold_tuning import tune_threshold
     from ratslam.runs.settings.strict_yaml import load, override
 
     path = find_config(arguments.config)
-    tuning = tune_threshold(override(load(path), arguments.set), path.parent, arguments.workers)
-    print(render_tuning(tuning))
-    if arguments.output:
-        plot, table = save_tuning(tuning, arguments.output)
-        print(f"\nwrote {plot} and {table}")
+    document = override(load(path), arguments.set)
+    for line in tune_threshold(document, path.parent, arguments.workers, arguments.output):
+        print(line)
     return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,42 +15,6 @@ _SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
 _GAP, _BOTTOM = 0.75, 0.9  # inches between panels, and below them
 _DOTS = (0, (2, 2))
 _MEDIAN = 0.3  # half width of a median bar, share of a condition's width
-
-
-class ExperienceHistory(NamedTuple):
-    """The current experience at each of T steps and the verdict of the Experience Metric.
-
-    Attributes:
-        place: [T] experience, -1 for none. counted: [T] a re-localisation. right: [T] a correct one.
-        invalid: [T] an experience created between an incorrect and the next correct re-localisation.
-        base: number of steps in the base set.
-    """
-
-    place: np.ndarray
-    counted: np.ndarray
-    right: np.ndarray
-    invalid: np.ndarray
-    base: int
-
-
-def experience_history(place: np.ndarray, metric: ExperienceMetric | None) -> ExperienceHistory:
-    """The history of T steps with the current experience `place` [T], -1 for none.
-
-    Args:
-        metric: the verdict on them; None: no step is a re-localisation.
-    """
-    none = np.zeros(len(place), bool)
-    if metric is None:
-        return ExperienceHistory(place, none, none, none, 0)
-    known = place >= 0
-    counted, right, invalid = none.copy(), none.copy(), none.copy()
-    counted[known], right[known] = metric.counted, metric.right
-    # An experience is invalid if the last re-localisation before it was wrong.
-    last = np.maximum.accumulate(np.where(counted, np.arange(len(counted)), -1))
-    wrong = (last >= 0) & ~right[last]
-    invalid[known] = wrong[creation_rows(place[known])]
-    base = int(np.flatnonzero(known)[metric.base - 1]) + 1
-    return ExperienceHistory(place, counted, right, invalid, base)
 
 
 def draw_drift(
@@ -79,21 +42,38 @@ def draw_drift(
     return figure
 
 
-def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory]) -> style.Figure:
-    """Draws the experience at each step, the end of the base set and the verdicts (Fig. 3)."""
+def draw_experiences(
+    title: str, line: str, runs: Mapping[str, tuple[np.ndarray, ExperienceMetric | None]]
+) -> style.Figure:
+    """Draws the experience at each step, the end of the base set and the verdicts (Fig. 3).
+
+    Args:
+        runs: by name, the current experience at each of T steps, [T], -1 for none, and the verdict of the
+            Experience Metric; None: no step is a re-localisation.
+    """
     figure, panels = _panels(title, line, runs, 3.4)
-    for axes, run in zip(panels, runs.values(), strict=True):
-        new = (run.place >= 0) & ~run.counted
+    for axes, (place, metric) in zip(panels, runs.values(), strict=True):
+        known = place >= 0
+        # [T] whether a step is a re-localisation, a correct one, and of an experience that is invalid: the
+        # last re-localisation before it was created was wrong. Steps of the base set.
+        counted, right, invalid, base = *np.zeros((3, len(place)), bool), 0
+        if metric is not None:
+            counted[known], right[known] = metric.counted, metric.right
+            last = np.maximum.accumulate(np.where(counted, np.arange(len(counted)), -1))
+            wrong = (last >= 0) & ~right[last]
+            invalid[known] = wrong[creation_rows(place[known])]
+            base = int(np.flatnonzero(known)[metric.base - 1]) + 1
+        new = known & ~counted
         for rows, color, mark, label in (
-            (new & ~run.invalid, GREY, "o", "valid experience"),
-            (new & run.invalid, YELLOW, "o", "invalid experience"),
-            (run.counted & run.right, BLUE, "o", "correct re-localisation"),
-            (run.counted & ~run.right, VERMILLION, "x", "incorrect re-localisation"),
+            (new & ~invalid, GREY, "o", "valid experience"),
+            (new & invalid, YELLOW, "o", "invalid experience"),
+            (counted & right, BLUE, "o", "correct re-localisation"),
+            (counted & ~right, VERMILLION, "x", "incorrect re-localisation"),
         ):
             steps = np.flatnonzero(rows)
-            axes.plot(steps, run.place[steps], mark, ms=2.6 if mark == "o" else 3.6,
+            axes.plot(steps, place[steps], mark, ms=2.6 if mark == "o" else 3.6,
                       mew=0.9 if mark == "x" else 0, color=color, label=label)  # fmt: skip
-        axes.axvline(run.base - 0.5, color=INK, lw=1.1, ls=_DOTS, label="end of the base set")
+        axes.axvline(base - 0.5, color=INK, lw=1.1, ls=_DOTS, label="end of the base set")
         axes.grid(color=LINE_GREY, lw=0.7)
         style.name_axes(axes, "step", "experience")
     style.add_legend(figure, panels[0], columns=3)
