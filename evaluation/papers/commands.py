@@ -185,13 +185,16 @@ def _threshold(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from evaluation.papers.fox2012.template_training import drive_held_out, render_drives, train_to_file
+    from evaluation.papers.fox2012.template_training import drive_held_out, render_drives
+    from robot.simulation.create.simulated_session import train_strain_templates
 
     create_simulation = read_config(arguments).create_simulation
     if create_simulation is None:
         where, cure = f"{arguments.config}: create_simulation", "`create_simulation: {}` gives the default"
         raise InputError(where, "missing", "the Create to train", cure)
-    templates = train_to_file(create_simulation, arguments.output)
+    templates = train_strain_templates(create_simulation)
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    templates.write(arguments.output)
     print(render_drives(drive_held_out(create_simulation, templates), templates.training.repeats))
     print(f"\nwrote {arguments.output}; `touch.reports.templates: {arguments.output}` uses it")
     return 0

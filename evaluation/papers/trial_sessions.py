@@ -252,19 +252,6 @@ class ArenaSession(NamedTuple):
     odometry: np.ndarray
 
 
-class FilterResult(NamedTuple):
-    """The result of a filter after T reports, in the frame of the arena.
-
-    Attributes:
-        online: [T, 3] poses as estimated at the time. path: [T, 3] final poses. grid: the map drawn along
-            `path`.
-    """
-
-    online: np.ndarray
-    path: np.ndarray
-    grid: OccupancyGrid
-
-
 def simulate_session(config: CreateSimulationConfig) -> ArenaSession:
     """A session from a random start.
 
@@ -301,8 +288,9 @@ def observe_session(config: RunConfig, session: ArenaSession, seed: int) -> list
 
 def run_filter(
     config: RunConfig, session: ArenaSession, reports: list[Observation], stops: tuple[int, ...]
-) -> list[FilterResult]:
-    """The result of the configured filter after each number of reports in `stops`."""
+) -> list[tuple[np.ndarray, np.ndarray, OccupancyGrid]]:
+    """The result of the configured filter after each number of reports in `stops`, in the frame of the arena:
+    poses [T, 3] as estimated at the time, final poses [T, 3], and the map drawn along these."""
     touch = report_config_of(session.source.info, config.touch.reports)
     grid = config.grid
     if grid.side is None:
@@ -316,7 +304,7 @@ def run_filter(
         online += [step.pose for step in slam.replay(reports[len(online) : stop])]
         path = compose(start, slam.map.trajectory())
         drawn = draw_map(grid, touch.feelers, session.arena, path, marks)
-        found.append(FilterResult(compose(start, np.array(online)), path, drawn))
+        found.append((compose(start, np.array(online)), path, drawn))
     return found
 
 
