@@ -342,14 +342,13 @@ def _print_table(arguments: argparse.Namespace) -> int:
 
 def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
     """The lines of a table, each as soon as it is measured; only the modules of that table are loaded."""
-    from evaluation.papers.tables.comparison import Files
     from evaluation.papers.tables.markdown import select_rows
 
     if name == "touch":
         from evaluation.papers.tables import touch_table as touch
 
         rows = select_rows(arguments.rows, touch.ROWS, touch.DEFAULT_ROWS)
-        files = Files(arguments.output, arguments.against)
+        files = arguments.output, arguments.against
         first, sessions = arguments.first, arguments.sessions
         return touch.touch_table(rows, first, sessions, arguments.workers, arguments.backend, files)
     if name == "grid":
@@ -367,7 +366,7 @@ def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
         if name == "laser":
             rows = select_rows(arguments.rows, buildings.ROWS, tuple(buildings.ROWS))
             return buildings.laser_table(rows, copies, workers)
-        files = Files(arguments.output, arguments.against)
+        files = arguments.output, arguments.against
         return buildings.buildings_table(buildings.choose_rows(arguments.rows), copies, workers, files=files)
     if name == "health":
         from evaluation.papers.tables.health import health_table

@@ -139,7 +139,7 @@ def buildings_table(
     copies: int = 10,
     workers: int = 0,
     folder: Path = Path(),
-    files: Files = Files(),  # noqa: B008
+    files: Files = (None, None),
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its runs are done; totals and missing recordings below it.
 

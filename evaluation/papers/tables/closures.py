@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 from scipy.optimize import minimize
@@ -58,18 +58,9 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class JudgedSession(NamedTuple):
-    """The n sequences of a session.
-
-    Attributes:
-        true: [n] bool. score: [n] evidence of recall. accepted: [n] bool. known: evidence when all, `YOUNG`
-            and no keyframes have followed them.
-    """
-
-    true: np.ndarray
-    score: np.ndarray
-    accepted: np.ndarray
-    known: tuple[SequenceEvidence, SequenceEvidence, SequenceEvidence]
+JudgedSession = tuple[np.ndarray, np.ndarray, np.ndarray, tuple[SequenceEvidence, ...]]
+"""The n sequences of a session: [n] bool, true; [n] evidence of recall; [n] bool, accepted; evidence when
+all, `YOUNG` and no keyframes have followed them."""
 
 
 def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = None) -> Iterator[str]:
@@ -113,21 +104,17 @@ def _judge_session(task: TouchTask) -> JudgedSession:
     # Sequences count from this evidence of recall and this number of candidates on.
     chosen = np.flatnonzero((scores >= 5.0) & (final.log.left() >= 2))
     later = steps >= (int(CHANGE * len(truth)) if task.row == "control: other maze" else 0)
-    first, second, third = (
+    known = (
         sequence_evidence(graph, final.fit, final.log, final.cut, chosen, after)
         for after in (BEYOND, YOUNG, 0)
     )
-    return JudgedSession(
-        _are_true(graph, final.log, truth[steps], later, chosen),
-        scores[chosen],
-        final.log.verdicts()[chosen] == Verdict.ACCEPTED,
-        (first, second, third),
-    )
+    true = _are_true(graph, final.log, truth[steps], later, chosen)
+    return true, scores[chosen], final.log.verdicts()[chosen] == Verdict.ACCEPTED, tuple(known)
 
 
 def fit_weights(sessions: Sequence[JudgedSession]) -> np.ndarray:
     """The weights [2, 3 + 2 KINDS] of a logistic regression over the map, and of one over the older pass."""
-    versions = [(evidence, one.true) for one in sessions for evidence in one.known]
+    versions = [(evidence, true) for true, _, _, known in sessions for evidence in known]
     features = np.concatenate([evidence.features() for evidence, _ in versions])
     true = np.concatenate([true for _, true in versions]).astype(float)
     known = np.isfinite(features).all(axis=(1, 2))
@@ -172,7 +159,7 @@ def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[np.ndar
     """A row of the table; each session with its own weights."""
     true, score, accepted = (np.concatenate([one[k] for one in sessions]) for k in range(3))
     odds, ended = (
-        np.concatenate([one.known[k].log_odds(own) for one, own in zip(sessions, fitted, strict=True)])
+        np.concatenate([one[3][k].log_odds(own) for one, own in zip(sessions, fitted, strict=True)])
         for k in (0, 2)
     )
     known = np.isfinite(odds)

@@ -27,7 +27,7 @@ METRICS = TouchMetrics(
 SESSION = touch.SessionFigures(
     METRICS, revisits_closed=0.8, em_live=0.04, em_pieces=0.008, unjoined=0.1, across=40, recovery=()
 )
-ARENA = grid.GridFigures(0.02, 0.2, np.radians([1.0, 20.0]), 4, (0.9, 0.4, 0.3, 0.04, 0.05))
+ARENA = 0.02, 0.2, np.radians([1.0, 20.0]), 4, [0.9, 0.4, 0.3, 0.04, 0.05]
 
 
 def stub_sessions(monkeypatch, module, result):
