@@ -195,7 +195,7 @@ def measure_lesions(
     tasks = [
         _LesionTask(lesion, row, maze) for row in rows for maze in task.seeds(USUAL) for lesion in lesions
     ]
-    if not INTEL.missing(Path()):
+    if not INTEL.missing():
         tasks += [_LesionTask(lesion, "", task.first) for lesion in lesions if lesion != EXCHANGED]
     return dict(zip(tasks, run_tasks(_run_lesion, tasks, workers=task.workers), strict=True))
 
@@ -219,7 +219,7 @@ def _run_lesion(task: _LesionTask) -> _LesionFigures:
         functions = LESIONS[task.lesion](task.maze)
     with replaced(functions):
         if not task.row:
-            claims = closure_claims(run_recording(INTEL.configuration(Path())))
+            claims = closure_claims(run_recording(INTEL.configuration()))
             true = int((claims.accepted & (claims.distance <= FALSE_DISTANCE)).sum())
             return _LesionFigures(None, np.flatnonzero(claims.accepted)[:, None], true)
         result, figures = run_and_measure(TouchTask(task.row, task.maze), new_session)

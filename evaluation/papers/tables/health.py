@@ -24,7 +24,7 @@ from evaluation.papers.tables.buildings import HARM_FACTOR, HARM_MARGIN
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import Recording, real_recordings
 from evaluation.papers.tables.spoilt_maps import spoilt_maps
-from evaluation.papers.tables.touch_table import MAIN, ROWS
+from evaluation.papers.tables.touch_table import MAIN, NOISE, ROWS
 from evaluation.papers.trial_sessions import run_recording
 from evaluation.studies.executor import run_tasks
 from evaluation.studies.perturbation import miscalibrate
@@ -32,7 +32,6 @@ from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import DOUBTED, INTERCEPT, WEIGHTS, health_features
 from ratslam.runs.settings.run_config import RunConfig
-from robot.simulation.head.odometry_errors import OdometryConfig
 
 FIRST_MAZE = 31000
 RIDGE = 2.0
@@ -40,22 +39,15 @@ RIDGE = 2.0
 CLEAR = 1.25
 """Ratio of the errors of map and odometry beyond which one is clearly better."""
 EXPLORATION = {"path": {"explore": 900}}
-NOISE = OdometryConfig()
-
-
-def _noise(factor: float) -> dict[str, Any]:
-    """Settings of the odometry with this factor on its noise."""
-    return {"odometry": {"length": factor * NOISE.length, "heading": factor * NOISE.heading}}
-
-
 TOUCH: dict[str, dict[str, Any]] = {
     "main": MAIN,
     "exploration": EXPLORATION,
-    "open arena": MAIN | EXPLORATION | {"maze": {"share": 0.08}},
-    "tree": MAIN | EXPLORATION | {"maze": {"kind": "tree"}},
-    "good odometry": EXPLORATION | _noise(0.25),
+    "open arena": ROWS["open arena"].simulation | EXPLORATION,
+    "tree": ROWS["tree"].simulation | EXPLORATION,
+    "good odometry": EXPLORATION
+    | {"odometry": {"length": 0.25 * NOISE.length, "heading": 0.25 * NOISE.heading}},
     "white": ROWS["white"].simulation,
-    "noise x 2": MAIN | _noise(2.0),
+    "noise x 2": ROWS["noise x 2"].simulation,
 }
 """Settings `simulation` of the whisker sessions."""
 REAL = {
@@ -76,14 +68,14 @@ RATIO, BAD, CLOSURES = -3, -2, -1
 it is bad, number of closures."""
 
 
-def health_table(sessions: int = 2, workers: int = 0, folder: Path = Path()) -> Iterator[str]:
+def health_table(sessions: int = 2, workers: int = 0) -> Iterator[str]:
     """The lines of the table.
 
     Args:
-        sessions: of each row; recordings are perturbed copies but the first. folder: of the repository.
+        sessions: of each row; recordings are perturbed copies but the first.
     """
     rows = [*TOUCH, *(REAL if real_recordings() else ())]
-    tasks = [(row, number, folder) for row in rows for number in range(sessions)]
+    tasks = [(row, number) for row in rows for number in range(sessions)]
     found = list(run_tasks(_judge_session, tasks, workers=workers))
     weights, final = (fit_weights(np.concatenate(maps)) for maps in (found[0::2], found))
     constants = np.array([INTERCEPT, *WEIGHTS])
@@ -96,7 +88,7 @@ def health_table(sessions: int = 2, workers: int = 0, folder: Path = Path()) -> 
     yield f"\nIntercept and weights fitted on all sessions: {', '.join(f'{w:.2f}' for w in final)}."
 
 
-def _judge_session(task: tuple[str, int, Path]) -> np.ndarray:
+def _judge_session(task: tuple[str, int]) -> np.ndarray:
     """Runs a session, of a row and a number, and judges its spoilt maps."""
     number = task[1]
     config, touch = task_config(*task)
@@ -123,8 +115,8 @@ def _judge_session(task: tuple[str, int, Path]) -> np.ndarray:
     return np.array(rows, float).reshape(len(rows), len(WEIGHTS) + 3)
 
 
-def task_config(row: str, number: int, folder: Path) -> tuple[RunConfig, bool]:
-    """The configuration of a session, and whether it is a whisker session; folder: of the repository."""
+def task_config(row: str, number: int) -> tuple[RunConfig, bool]:
+    """The configuration of a session, and whether it is a whisker session."""
     if row in TOUCH:
         maze = FIRST_MAZE + number
         simulation = TOUCH[row]
@@ -134,7 +126,7 @@ def task_config(row: str, number: int, folder: Path) -> tuple[RunConfig, bool]:
     config, file = REAL[row]
     settings = (f"recording.file={(real_recordings() or Path()).absolute() / file}",) if file else ()
     recording = Recording(row, config, settings, real=True)
-    return recording.configuration(folder, "session.reserve=1024"), False
+    return recording.configuration("session.reserve=1024"), False
 
 
 def fit_weights(maps: np.ndarray) -> np.ndarray:

@@ -17,7 +17,8 @@ GOLDEN = "../tests/golden"
 
 
 class Recording(NamedTuple):
-    """A recording of a table: its label, configuration, and replaced settings, each `a.b=value`.
+    """A recording of a table: its label, configuration (from the folder of the repository), and replaced
+    settings, each `a.b=value`.
 
     Attributes:
         real: whether it is one of `DATA`.
@@ -28,25 +29,21 @@ class Recording(NamedTuple):
     assignments: tuple[str, ...] = ()
     real: bool = False
 
-    def configuration(self, folder: Path, *assignments: str) -> RunConfig:
+    def configuration(self, *assignments: str) -> RunConfig:
         """Its configuration with further settings replaced.
-
-        Args:
-            folder: of the repository.
 
         Raises:
             InputErrors: the file or a replaced setting is not valid.
         """
-        return load_config(folder / self.config, [*self.assignments, *assignments])
+        return load_config(self.config, [*self.assignments, *assignments])
 
-    def missing(self, folder: Path) -> str:
+    def missing(self) -> str:
         """The reason that it cannot be used; "" if it can."""
         if self.real and not os.environ.get(DATA):
             return f"set {DATA} to the folder of the real recordings"
-        config = folder / self.config
-        if not config.exists():
-            return f"{config} does not exist; run the command in the repository"
-        recording = self.configuration(folder).recording
+        if not Path(self.config).exists():
+            return f"{self.config} does not exist; run the command in the repository"
+        recording = self.configuration().recording
         if recording is None or recording.file.exists():
             return ""
         return f"{recording.file} does not exist"

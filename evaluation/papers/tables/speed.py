@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -204,19 +203,19 @@ SINGLE = 400
 """Steps of a single network."""
 
 
-def batch_table(sets: int, sessions: int, steps: int, rounds: int, folder: Path = Path()) -> Iterator[str]:
+def batch_table(sets: int, sessions: int, steps: int, rounds: int) -> Iterator[str]:
     """The lines of the table, each as soon as it is timed.
 
     Args:
         sets, sessions: number in one call on a GPU; on the processor a fifth of the sets and `RECORDED`
             sessions, as its time for each does not depend on their number. steps: of a session. rounds:
-            repeats, of which the median is taken. folder: of the repository, which holds `configs`.
+            repeats, of which the median is taken.
     """
     prepare_precision("float64")
     yield markdown_header(["what is computed", "device", "us a step of each"])
     core = jax.devices("cpu")[0]
     with jax.default_device(core):
-        backend, recordings = _record_circuits(steps, folder)
+        backend, recordings = _record_circuits(steps)
     for device in dict.fromkeys([jax.devices()[0], core]):
         gpu = device.platform != "cpu"
         name = device.device_kind if gpu else "one core"
@@ -251,12 +250,12 @@ def batch_table(sets: int, sessions: int, steps: int, rounds: int, folder: Path 
     yield markdown_row([what, "one core", f"{us:.1f}"])
 
 
-def _record_circuits(steps: int, folder: Path) -> tuple[RecallBackend, list[Recording]]:
+def _record_circuits(steps: int) -> tuple[RecallBackend, list[Recording]]:
     """The backend and recordings of the first steps of `RECORDED` whisker sessions of ten circuits whose maps
     need as many pose cells."""
     recordings: list[Recording] = []
     for seed in count():
-        config = load_config(folder / SESSIONS["circuits"], [f"simulation.seed={seed}"])
+        config = load_config(SESSIONS["circuits"], [f"simulation.seed={seed}"])
         with open_observations(config) as (config, source):
             log = load_into_memory(source)
         observations = [observation_of(sample) for sample in log][:steps]

@@ -159,9 +159,9 @@ def _measure_create(folder: Path) -> CreateResult:
     distances = wall_distances(np.stack([seen["x"], seen["y"]], axis=1), pressed, segments)
     # By the classic method, and by keyframes: with half, once and twice the cell size and sector width.
     rows = {name: row for name, row in buildings_rows().items() if row.section == "create"}
-    configs = {"classic": rows[DEFAULT].recording.configuration(Path(), "backend=classic")}
+    configs = {"classic": rows[DEFAULT].recording.configuration("backend=classic")}
     variants = {}
-    for name, config in (configs | {name: row.configuration(Path()) for name, row in rows.items()}).items():
+    for name, config in (configs | {name: row.configuration() for name, row in rows.items()}).items():
         run = run_recording(config)
         variants[name] = _measure_variant(run)
         if name == DEFAULT:

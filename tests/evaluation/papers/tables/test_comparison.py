@@ -28,7 +28,6 @@ from evaluation.studies.metrics import TouchMetrics
 from ratslam.cli import main
 from tactile.base.errors import InputError
 
-ROOT = Path(__file__).parents[4]
 ROWS = ("clean", "main")
 SESSION = touch.SessionFigures(
     TouchMetrics(
@@ -113,7 +112,7 @@ def test_buildings_write_each_run_and_compare_final_maps_worse_than_odometry(
         closures, sequences = np.array([True, False]), np.array([[True, True], [True, False], [False, True]])
         figures = buildings.RunFigures(1.0, final, 1.2, closures, sequences, np.zeros(3))
         monkeypatch.setattr(buildings, "run_tasks", lambda _, tasks, workers: iter([figures] * len(tasks)))
-        return list(buildings.buildings_table(rows, 6, folder=ROOT, files=files))
+        return list(buildings.buildings_table(rows, 6, files=files))
 
     rows = {
         "lab": buildings.BuildingsRow(Recording("lab", "configs/square.yaml"), "buildings", "miscalibrated")

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from evaluation.papers.tables import health
 from evaluation.papers.tables.health import fit_weights
-
-ROOT = Path(__file__).parents[4]
 
 
 def judged(seed, count=80):
@@ -46,6 +42,6 @@ def test_every_second_session_tests_the_regression(monkeypatch):
 
 @pytest.mark.parametrize("row", health.TOUCH)
 def test_rows_are_valid_configurations(row):
-    config, touch = health.task_config(row, 3, ROOT)
+    config, touch = health.task_config(row, 3)
     assert touch
     assert config.simulation.maze.seed == health.FIRST_MAZE + 3
