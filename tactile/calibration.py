@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from tactile.base.errors import InputError
-from tactile.base.samples import longest_run, robust_sd
+from tactile.base.samples import robust_sd, true_runs
 from tactile.base.settings import Settings
 from tactile.base.types import Cycle
 
@@ -198,8 +198,9 @@ def _clean_stretch(record: np.ndarray, limit: np.ndarray) -> slice | None:
     quiet = np.all(quiet & (variances <= limit**2), axis=-1)
     if not quiet.any():
         return None
-    run = longest_run(quiet)
-    return slice(run.start * (WINDOW // 2), (run.stop - 1) * (WINDOW // 2) + WINDOW + LAG)
+    runs = true_runs(quiet)
+    first, end = runs[np.argmax(runs[:, 1] - runs[:, 0])].tolist()  # the first of the longest ones
+    return slice(first * (WINDOW // 2), (end - 1) * (WINDOW // 2) + WINDOW + LAG)
 
 
 def _dirty_error(where: str, dirty: Mapping[int, str], cure: str) -> InputError:
