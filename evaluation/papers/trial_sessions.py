@@ -211,7 +211,13 @@ def run_recording(config: RunConfig, perturbation: Perturbation | None = None, s
 
 def closure_claims(run: RecordingRun) -> ClosureClaims:
     """The claims of all candidates in closures.csv that belong to a sequence."""
-    rows = [row for row in _closure_rows(run.session) if int(row["sequence"]) >= 0]
+    rows = list[dict[str, str]]()
+    if (write := run.session.map.files().get("closures.csv")) is not None:
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "closures.csv"
+            write(path)
+            table = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+        rows = [row for row in table if int(row["sequence"]) >= 0]
     step, match, shift, sequence = (
         np.array([int(row[name]) for row in rows], int)
         for name in ("step", "match_step", "shift", "sequence")
@@ -225,17 +231,6 @@ def closure_claims(run: RecordingRun) -> ClosureClaims:
         turn=np.abs(wrap(later[:, 2] - earlier[:, 2] + shift * angle)),
         log_odds=np.array([float(row["log_odds"]) for row in rows], float),
     )
-
-
-def _closure_rows(session: Session) -> list[dict[str, str]]:
-    """The rows of closures.csv by column; none for a map without that file."""
-    write = session.map.files().get("closures.csv")
-    if write is None:
-        return []
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "closures.csv"
-        write(path)
-        return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
 
 class ArenaSession(NamedTuple):

@@ -185,18 +185,29 @@ def _measure_create(folder: Path) -> CreateResult:
 
 def _table_create(result: CreateResult) -> list[str]:
     """The lines of the tables."""
-    lines = [markdown_header(COLUMNS)]
-    odometry = next(iter(result.variants.values())).odometry
-    lines.append(markdown_row(["odometry (control)", metres(odometry), metres(odometry), *["-"] * 6]))
+    odometry = metres(next(iter(result.variants.values())).odometry)
+    lines = [markdown_header(COLUMNS), markdown_row(["odometry (control)", odometry, odometry, *["-"] * 6])]
     for name, variant in result.variants.items():
         label = f"{name} (control)"
         if name.startswith("create "):
             _, cell, sector = name.split()
             label = f"recall, cell x {cell}, sector x {sector}" + " (defaults)" * (name == DEFAULT)
-        lines.append(markdown_row([label, *_cells(variant)]))
+        cells = [metres(value) for value in (variant.final, variant.live, variant.map)]
+        if np.isnan(variant.revisits):
+            cells += ["-"] * 5
+        else:
+            share = f"{variant.candidates}, {variant.right / max(variant.candidates, 1):.0%}"
+            cells += [f"{variant.doubt:.2f}", f"{variant.accepted}", f"{variant.false}", share]
+            cells.append(metres(variant.revisits))
+        lines.append(markdown_row([label, *cells]))
     lines.append(markdown_row(["odometry, true turns (bound)", metres(result.true_turns), *["-"] * 7]))
+    walls = [markdown_header(("robot to the nearest wall, m", "number", *(f"{p} %" for p in PERCENTILES)))]
+    names = "at the first reading of a contact", "at all readings (control)"
+    for name, values in zip(names, result.distances, strict=True):
+        spread = np.percentile(values, PERCENTILES)
+        walls.append(markdown_row([name, len(values), *(f"{value:.3f}" for value in spread)]))
     caveats = CAVEATS.format(drift=result.drift, latency=result.latency)
-    return [*lines, "", _summary(result), "", *_wall_table(result.distances), "", caveats]
+    return [*lines, "", _summary(result), "", *walls, "", caveats]
 
 
 CAVEATS = (
@@ -205,17 +216,6 @@ CAVEATS = (
     "{drift:.1f} rad over the session. A depth reading is {latency:.2f} s older than its time (median of the "
     "file's column)."
 )
-
-
-def _cells(variant: Variant) -> list[str]:
-    paths = [metres(value) for value in (variant.final, variant.live, variant.map)]
-    if np.isnan(variant.revisits):
-        return [*paths, *["-"] * 5]
-    share = f"{variant.candidates}, {variant.right / max(variant.candidates, 1):.0%}"
-    return [
-        *paths, f"{variant.doubt:.2f}", str(variant.accepted), str(variant.false), share,
-        metres(variant.revisits),
-    ]  # fmt: skip
 
 
 def _summary(result: CreateResult) -> str:
@@ -235,15 +235,6 @@ def _summary(result: CreateResult) -> str:
         f"{above[0]} at the end, {above[1]} live. False or not right: more than {FALSE_DISTANCE} m or "
         f"{np.degrees(FALSE_TURN):.0f} degrees from the truth."
     )
-
-
-def _wall_table(distances: tuple[np.ndarray, np.ndarray]) -> list[str]:
-    rows = [markdown_header(("robot to the nearest wall, m", "number", *(f"{p} %" for p in PERCENTILES)))]
-    names = "at the first reading of a contact", "at all readings (control)"
-    for name, values in zip(names, distances, strict=True):
-        spread = np.percentile(values, PERCENTILES)
-        rows.append(markdown_row([name, str(len(values)), *(f"{value:.3f}" for value in spread)]))
-    return rows
 
 
 def _draw_create(result: CreateResult, png: Path) -> None:
