@@ -203,8 +203,7 @@ def _train(arguments: argparse.Namespace) -> int:
 def _figures(arguments: argparse.Namespace) -> int:
     """The figures of pose cells, or those of real recordings."""
     from evaluation.papers.tables.markdown import select_rows
-    from evaluation.papers.tables.recordings import DATA, real_recordings
-    from evaluation.papers.whiskers.recordings import UNPROVEN
+    from evaluation.papers.tables.recordings import DATA, UNPROVEN, real_recordings
 
     if arguments.page == "cells":
         task: object = Task(arguments.first, arguments.sessions, arguments.workers)

@@ -74,7 +74,6 @@ def draw_experiences(
             axes.plot(steps, place[steps], mark, ms=2.6 if mark == "o" else 3.6,
                       mew=0.9 if mark == "x" else 0, color=color, label=label)  # fmt: skip
         axes.axvline(base - 0.5, color=INK, lw=1.1, ls=_DOTS, label="end of the base set")
-        axes.grid(color=LINE_GREY, lw=0.7)
         style.name_axes(axes, "step", "experience")
     style.add_legend(figure, panels[0], columns=3)
     return figure
@@ -116,7 +115,7 @@ def draw_measured(
             axes.tick_params(which="minor", length=0)
         else:
             axes.set_ylim(bottom=0)
-        axes.grid(color=LINE_GREY, lw=0.7, axis="y")
+        axes.grid(False, axis="x")
     fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
     style.add_legend(figure, fullest)
     return figure
@@ -153,7 +152,6 @@ def draw_curves(
             for number, (x, y) in enumerate(zip(arcr, arr, strict=True)):
                 axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
         axes.set(xlim=(-0.04, 1.04), ylim=(0, None))
-        axes.grid(color=LINE_GREY, lw=0.7)
         style.name_axes(axes, "ARCR, strict", "ARR")
     style.add_legend(figure, panels[0])
     return figure
@@ -180,11 +178,9 @@ def draw_tuning(
     figure, (left, right) = _panels("Tuning of the classic matcher", line, ("", ""), 3.4)
     for count, color, label in ((same, BLUE, "same place"), (other, VERMILLION, "different places")):
         left.stairs(count / max(count.sum(), 1), edge, color=color, fill=True, alpha=0.45, label=label)
-    left.grid(color=LINE_GREY, lw=0.7)
     style.name_axes(left, "difference of two views", "share of pairs")
     right.plot(threshold, correct, "o-", ms=3, lw=1.0, color=GREEN, label="correct")
     right.plot(threshold, incorrect, "x-", ms=4, lw=1.0, color=PURPLE, label="incorrect")
-    right.grid(color=LINE_GREY, lw=0.7)
     style.name_axes(right, "threshold", "re-localisations")
     for axes in (left, right):
         if winner is not None:
@@ -197,7 +193,7 @@ def draw_tuning(
 def _panels(
     title: str, line: str, names: Collection[str], height: float, *, across: int = 0, below: float = _BOTTOM
 ) -> tuple[style.Figure, list[style.Axes]]:
-    """A figure with a panel of a height in inches for each name, `across` per row (0: all)."""
+    """A figure with a panel of a height in inches for each name, `across` per row (0: all), with a grid."""
     across = across or len(names)
     rows = -(-len(names) // across)
     whole = style.TOP + rows * height + (rows - 1) * _GAP + below
@@ -210,11 +206,11 @@ def _panels(
         bottom = whole - style.TOP - (row + 1) * height - row * _GAP
         panels.append(style.add_axes(figure, left, bottom, width, height - 0.2))
         panels[-1].set_title(name, fontsize=9.5, color=INK, loc="left")
+        panels[-1].grid(color=LINE_GREY, lw=0.7)
     return figure, panels
 
 
 def _map_axes(axes: style.Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.locator_params(steps=[1, 2, 5, 10])  # short tick labels
-    axes.grid(color=LINE_GREY, lw=0.7)
     style.name_axes(axes, "x (m)", "y (m)")

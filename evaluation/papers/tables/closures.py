@@ -24,7 +24,6 @@ from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.touch_table import CHANGE, TouchTask, task_config
 from evaluation.papers.trial_sessions import run_session, start_session
 from evaluation.studies.executor import run_tasks
-from ratslam.core.session import Session
 from ratslam.mapping.closure_judge import (
     BEYOND,
     KINDS,
@@ -36,8 +35,7 @@ from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap
 from ratslam.runs.build_session import open_observations
-from ratslam.runs.settings.run_config import RunConfig
-from robot.sources.in_memory import InMemorySource, load_into_memory
+from robot.sources.in_memory import load_into_memory
 from tactile.base.se2 import between, wrap
 
 ROWS = (
@@ -90,14 +88,8 @@ def _judge_session(task: TouchTask) -> JudgedSession:
     """Runs a session and judges the sequences of its final map."""
     with open_observations(task_config(task)) as (config, source):
         log = load_into_memory(source)
-    held: list[Session] = []
-
-    def start(config: RunConfig, log: InMemorySource) -> Session:
-        held.append(start_session(config, log))
-        return held[0]
-
-    truth = run_session(config, log, start).truth
-    map = held[0].map
+    session = start_session(config, log)
+    truth, map = run_session(config, log, lambda *_: session).truth, session.map
     assert isinstance(map, KeyframeMap)
     final, graph, steps = map.solution(), map.keyframes(), map.keyframe_steps()
     scores = final.log.scores()

@@ -15,7 +15,7 @@ import numpy as np
 from evaluation.metrics.trajectory import align, ate
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.whiskers.recordings import require_recordings
+from evaluation.papers.tables.recordings import require_recordings
 from evaluation.plots import style
 from ratslam.core.estimates import GridDrawing
 from ratslam.core.session import Session

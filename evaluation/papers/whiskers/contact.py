@@ -18,8 +18,8 @@ from scipy.ndimage import uniform_filter1d
 
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.recordings import REACH, require_recordings
 from evaluation.papers.whiskers.drift import Decide, Snippet, fit_free_model, score_stream, simulate_stream
-from evaluation.papers.whiskers.recordings import REACH, require_recordings
 from evaluation.plots import style
 from robot.recordings.real_whiskers import WHISKERS, ReachConfig, ReachRecord, read_reach
 from tactile.base.errors import InputError
@@ -200,8 +200,8 @@ def _draw_contacts(result: _ContactResult, png: Path) -> None:
     line = "magnetic whiskers on an arm; 20 sd: rule of Salman & Pearson 2016, mean and sd of the first 0.5 s"
     figure = style.new_figure(7.6, "Contact on an arm in clutter", line)
     _draw_rows(style.add_axes(figure, 0.75, 3.0, 7.0, 3.4), result)
-    _draw_release(style.add_axes(figure, 0.75, 0.55, 3.1, 1.75), result)
-    _draw_drift(style.add_axes(figure, 4.7, 0.55, 3.05, 1.75), result)
+    let_go = style.add_axes(figure, 0.75, 0.55, 3.1, 1.75)
+    _draw_signals(let_go, style.add_axes(figure, 4.7, 0.55, 3.05, 1.75), result)
     figure.savefig(png)
 
 
@@ -222,41 +222,34 @@ def _draw_rows(axes: Axes, result: _ContactResult) -> None:
         axes.text(across, 1.02, f"■ {name}", color=colour, fontsize=9, transform=axes.transAxes)
 
 
-def _draw_release(axes: Axes, result: _ContactResult) -> None:
-    """The channel of the strongest signal of the first whisker that is let go, around that time."""
-    whisker = int(np.argmax(~result.never & ~result.contact[-1]))
-    end = true_runs(result.contact[:, whisker])[0][1]
+def _draw_signals(let_go: Axes, drifting: Axes, result: _ContactResult) -> None:
+    """Departures from the free mean: of the strongest channel of the first whisker that is let go, around
+    that time, and of the channel that drifts most among whiskers that never touch, with its baseline."""
+    signal, free, rate = result.record.signal, result.free, result.config.rate
+    scaled, base = ((part - free.mean) / free.noise for part in (signal, result.baseline))
+    first = int(np.argmax(~result.never & ~result.contact[-1]))
+    end = true_runs(result.contact[:, first])[0][1]
     rows = np.arange(end - 25, end + 55)
-    channel = int(
-        np.argmax(np.abs(result.record.signal[:end, whisker] - result.free.mean[whisker]).max(axis=0))
-    )
-    noise = result.free.noise[whisker, channel]
-    departure = (result.record.signal[rows, whisker, channel] - result.free.mean[whisker, channel]) / noise
-    time = rows / result.config.rate
-    axes.axvspan(time[0], end / result.config.rate, color=style.BLUE, alpha=0.15, lw=0)
+    strongest = int(np.argmax(np.abs(signal[:end, first] - free.mean[first]).max(axis=0)))
+    departure, time = scaled[rows, first, strongest], rows / rate
     beyond = np.abs(departure) > 20
-    axes.plot(time, departure, color=style.GREY, lw=0.8)
-    axes.plot(time[beyond], departure[beyond], ".", color=style.VERMILLION, ms=3)
-    axes.plot(time[~beyond], departure[~beyond], ".", color=style.INK, ms=3)
-    axes.set(xlim=(time[0], time[-1]), ylim=(-60, 120))
-    name = f"{WHISKERS[whisker]}, {'xyz'[channel]}: let go, it rings"
-    axes.set_title(name, loc="left", fontsize=10, color=style.INK)
-    style.name_axes(axes, "time, s", "departure, sd of the noise")
-
-
-def _draw_drift(axes: Axes, result: _ContactResult) -> None:
-    """The channel that drifts most among the whiskers that never touch, and its tracked baseline."""
-    scaled = (result.record.signal - result.free.mean) / result.free.noise
-    base = (result.baseline - result.free.mean) / result.free.noise
+    let_go.axvspan(time[0], end / rate, color=style.BLUE, alpha=0.15, lw=0)
+    let_go.plot(time, departure, color=style.GREY, lw=0.8)
+    let_go.plot(time[beyond], departure[beyond], ".", color=style.VERMILLION, ms=3)
+    let_go.plot(time[~beyond], departure[~beyond], ".", color=style.INK, ms=3)
+    let_go.set(xlim=(time[0], time[-1]), ylim=(-60, 120))
     reach = np.where(result.never[:, None], np.abs(base).max(axis=0), 0.0)
     whisker, channel = np.unravel_index(int(np.argmax(reach)), reach.shape)
-    time = np.arange(len(scaled)) / result.config.rate
-    axes.plot(time, scaled[:, whisker, channel], color=style.GREY, lw=0.4)
-    axes.plot(time, base[:, whisker, channel], color=style.BLUE, lw=1.2)
-    axes.set(xlim=(0, time[-1]))
-    title = f"{WHISKERS[whisker]}, {'xyz'[channel]}: free, it drifts"
-    axes.set_title(title, loc="left", fontsize=10, color=style.INK)
-    style.name_axes(axes, "time, s", "departure, sd of the noise")
+    time = np.arange(len(scaled)) / rate
+    drifting.plot(time, scaled[:, whisker, channel], color=style.GREY, lw=0.4)
+    drifting.plot(time, base[:, whisker, channel], color=style.BLUE, lw=1.2)
+    drifting.set(xlim=(0, time[-1]))
+    for axes, name, at, what in (
+        (let_go, WHISKERS[first], strongest, "let go, it rings"),
+        (drifting, WHISKERS[whisker], channel, "free, it drifts"),
+    ):
+        axes.set_title(f"{name}, {'xyz'[at]}: {what}", loc="left", fontsize=10, color=style.INK)
+        style.name_axes(axes, "time, s", "departure, sd of the noise")
 
 
 def _measure_contacts(data: Path) -> _ContactResult:

@@ -17,10 +17,9 @@ from evaluation.metrics.trajectory import align, ate
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.buildings import buildings_rows
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.tables.recordings import metres
+from evaluation.papers.tables.recordings import metres, require_recordings
 from evaluation.papers.trial_sessions import RecordingRun, closure_claims, run_recording
 from evaluation.papers.whiskers.bumps import wall_distances
-from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.plots.style import BLUE, GREY, INK, VERMILLION, add_axes, name_axes, new_figure
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict

@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.whiskers.recordings import REACH, require_recordings
+from evaluation.papers.tables.recordings import REACH, require_recordings
 from robot.recordings.real_whiskers import read_columns, read_reach
 from robot.simulation.head.baseline import HALL_BASELINE, Baseline, BaselineConfig
 from tactile.base.random_streams import stream

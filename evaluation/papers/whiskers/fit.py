@@ -9,7 +9,7 @@ import numpy as np
 from evaluation.metrics.trajectory import ate
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_row
-from evaluation.papers.whiskers.recordings import REACH, require_recordings
+from evaluation.papers.tables.recordings import REACH, require_recordings
 from evaluation.plots import style
 from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config

@@ -17,7 +17,7 @@ from scipy.special import expit, logit
 
 from evaluation.metrics.statistics import auc, expected_calibration_error
 from evaluation.papers.figure import Figure
-from evaluation.papers.whiskers.recordings import require_recordings
+from evaluation.papers.tables.recordings import require_recordings
 from ratslam.recall.signed_likelihood import ImagePairs, learn, log_odds, project, stored_image
 from robot.recordings.real_whiskers import read_contacts, read_object
 from tactile.base.random_streams import stream

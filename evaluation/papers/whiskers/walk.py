@@ -19,9 +19,9 @@ import numpy as np
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import align
 from evaluation.papers.figure import Figure
+from evaluation.papers.tables.recordings import require_recordings
 from evaluation.papers.trial_sessions import collect_session, run_session
 from evaluation.papers.whiskers.likeness import OBJECTS
-from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.papers.whiskers.walk_source import (
     WalkConfig,
     most_needed,
