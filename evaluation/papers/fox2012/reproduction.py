@@ -32,7 +32,6 @@ from evaluation.metrics.statistics import bootstrap
 from evaluation.metrics.trajectory import position_error
 from evaluation.papers.paper_sets import Paper, ResultRow, column, count_sets, run_with_progress
 from evaluation.papers.trial_sessions import (
-    ArenaSession,
     collect_marks,
     draw_map,
     observe_session,
@@ -398,7 +397,23 @@ def run_job(job: _SessionJob) -> list[ResultRow]:
     session = simulate_session(some.create_simulation)
     count = len(session.truth)
     stops = tuple(min(stop, count) if stop else count for stop in job.stops)
-    found: list[ResultRow] = []
+
+    def score(
+        key: tuple[str, str, str], stop: int, online: np.ndarray, path: np.ndarray, grid: OccupancyGrid
+    ) -> ResultRow:
+        truth, odometry = session.truth[: len(path)], session.odometry[: len(path)]
+        found = score_grid(grid, true_grid(session.arena._replace(start=np.zeros(3)), grid), key[1])
+        values = {
+            "reports": len(path),
+            "odometry_error": position_error(odometry, truth),
+            **path_metrics(online, path, truth),
+            **{error.convention.column: error.error for error in found.errors},
+            **{name: found.quantities[name].value for name in _MAP_METRICS},
+        }
+        result = _MapResult(stop, found, grid, session.arena, truth, odometry, online)
+        return ResultRow((job.world, *key), job.number, job.seed, values, result)
+
+    rows: list[ResultRow] = []
     for variant, config in job.variants.items():
         reports = observe_session(config, session, job.training)
         marks = collect_marks(reports)
@@ -408,31 +423,8 @@ def run_job(job: _SessionJob) -> list[ResultRow]:
             for name, whole in ((RECKONED, session.odometry), (TRUE, session.truth)):
                 path = whole[: stops[stop]]
                 ways[name] = path, path, draw_map(config.grid, feelers, session.arena, path, marks)
-            found += [_score(job, session, (*variant, name), stop, *way) for name, way in ways.items()]
-    return found
-
-
-def _score(
-    job: _SessionJob,
-    session: ArenaSession,
-    key: tuple[str, str, str],
-    stop: int,
-    online: np.ndarray,
-    path: np.ndarray,
-    grid: OccupancyGrid,
-) -> ResultRow:
-    count = len(path)
-    truth, odometry = session.truth[:count], session.odometry[:count]
-    score = score_grid(grid, true_grid(session.arena._replace(start=np.zeros(3)), grid), key[1])
-    values = {
-        "reports": count,
-        "odometry_error": position_error(odometry, truth),
-        **path_metrics(online, path, truth),
-        **{error.convention.column: error.error for error in score.errors},
-        **{name: score.quantities[name].value for name in _MAP_METRICS},
-    }
-    result = _MapResult(stop, score, grid, session.arena, truth, odometry, online)
-    return ResultRow((job.world, *key), job.number, job.seed, values, result)
+            rows += [score((*variant, name), stop, *way) for name, way in ways.items()]
+    return rows
 
 
 _run = partial(run_with_progress, run_job)

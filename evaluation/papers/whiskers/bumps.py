@@ -89,11 +89,7 @@ class BumpsResult(NamedTuple):
 
 
 def _measure(folder: Path) -> BumpsResult:
-    """Maps the drive with every variant and seed.
-
-    Raises:
-        InputError: a recording is missing or damaged.
-    """
+    """Maps the drive with every variant and seed."""
     walls = require_recordings(folder, *(f"data/create_lab_{name}.csv" for name in FILES))[-1]
     with open_observations(load_config(CONFIG)) as (_, source):
         samples = list(source)

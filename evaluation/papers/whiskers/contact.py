@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from enum import IntEnum
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -48,19 +47,13 @@ BLOCK = 2400
 FOLDER = Path(__file__).with_name("annotations")
 """A CSV file for each annotator: whisker, start_row, end_row (exclusive), label; it covers every row of every
 whisker."""
-
-
-class Label(IntEnum):
-    """A mark of an annotator."""
-
-    FREE = 0
-    CONTACT = 1
-    UNCLEAR = 2
+LABELS = ("free", "contact", "unclear")
+"""Marks of an annotator, stored by their numbers."""
+FREE, CONTACT, UNCLEAR = range(3)
 
 
 def read_annotators(folder: Path, whiskers: Sequence[str], rows: int) -> dict[str, np.ndarray]:
-    """The marks of each annotator, [rows, W] int8, the `Label` of each row; none where the folder has no CSV
-    file.
+    """The marks of each annotator, [rows, W] int8 by `LABELS`; none where the folder has no CSV file.
 
     Raises:
         InputError: a file is not such a table, or marks a row twice or not at all.
@@ -78,9 +71,9 @@ def _read_annotation(path: Path, whiskers: Sequence[str], rows: int) -> np.ndarr
     for line, stretch in enumerate(stretches, start=2):
         where = f"{path}:{line}"
         try:
-            column, label = whiskers.index(stretch["whisker"]), Label[stretch["label"].upper()]
+            column, label = whiskers.index(stretch["whisker"]), LABELS.index(stretch["label"].lower())
             first, last = int(stretch["start_row"]), int(stretch["end_row"])
-        except (ValueError, KeyError, AttributeError, TypeError):
+        except (ValueError, AttributeError, TypeError):
             expected = f"one of {', '.join(whiskers)}, two row numbers, and contact, free or unclear"
             raise InputError(where, str(stretch), expected) from None
         if not 0 <= first < last <= rows or (marks[first:last, column] >= 0).any():
@@ -99,12 +92,12 @@ def score_contacts(contact: np.ndarray, marks: np.ndarray) -> tuple[float, ...]:
         precision and recall of the rows that are clear; the same of all rows, every unclear one counted as
         wrong; share of unclear rows. NaN without rows to divide by.
     """
-    marked, unclear = marks == Label.CONTACT, marks == Label.UNCLEAR
+    marked, unclear = marks == CONTACT, marks == UNCLEAR
     right = int((contact & marked).sum())
     false, missed, doubtful, silent = (
         int(rows.sum())
         for rows in (
-            contact & (marks == Label.FREE),
+            contact & (marks == FREE),
             ~contact & marked,
             contact & unclear,
             ~contact & unclear,
@@ -253,11 +246,7 @@ def _draw_signals(let_go: Axes, drifting: Axes, result: _ContactResult) -> None:
 
 
 def _measure_contacts(data: Path) -> _ContactResult:
-    """Contacts of the record, by the tracked baseline and by the 20-sd rule.
-
-    Raises:
-        InputError: the record or an annotation is missing or damaged.
-    """
+    """Contacts of the record, by the tracked baseline and by the 20-sd rule."""
     config = ReachConfig(file=require_recordings(data, REACH)[0])
     record = read_reach(config.file)
     signal, first = record.signal, record.signal[: config.free_rows]
@@ -384,10 +373,10 @@ def _mark_lines(contacts: dict[str, np.ndarray], touching: np.ndarray) -> list[s
     if len(marks) != 2:
         return ["Precision and recall: not annotated."]
     one, other = marks.values()
-    agreed = np.where(one == other, one, Label.UNCLEAR)
+    agreed = np.where(one == other, one, UNCLEAR)
     lines = [
         f"Annotators {' and '.join(marks)}: agreement {(one == other).mean():.1%} of rows, unclear "
-        f"{(agreed == Label.UNCLEAR).mean():.1%} (goal: at most 15 %).",
+        f"{(agreed == UNCLEAR).mean():.1%} (goal: at most 15 %).",
         "",
         "| whisker | rule | unclear | precision | recall | unclear counted as wrong: precision | recall |",
         "|---|---|---|---|---|---|---|",

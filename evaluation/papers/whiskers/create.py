@@ -145,11 +145,7 @@ class CreateResult(NamedTuple):
 
 
 def _measure_create(folder: Path) -> CreateResult:
-    """Runs all sessions; in the folder of the repository, which holds `configs`.
-
-    Raises:
-        InputError: a recording is missing.
-    """
+    """Runs all sessions; in the folder of the repository, which holds `configs`."""
     seen, bumps, walls, depth = (
         np.genfromtxt(path, delimiter=",", names=True) for path in require_recordings(folder, *FILES)
     )

@@ -85,11 +85,7 @@ DriftResult = tuple[dict[str, _FreeFigures], dict[str, Creep]]
 
 
 def _measure_drift(folder: Path) -> DriftResult:
-    """The figures of real and simulated whiskers.
-
-    Raises:
-        InputError: a recording is missing or damaged.
-    """
+    """The figures of real and simulated whiskers."""
     reach, camera = require_recordings(folder, REACH, CAMERA)
     signal = read_reach(reach).signal
     free: dict[str, _FreeFigures] = {}

@@ -15,7 +15,7 @@ from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
 from ratslam.service.record_fit import RevisitFit, fit_revisits, read_signals_of_reach
 from ratslam.service.rig_fit import WheelFit, fit_wheels
-from robot.sources.in_memory import InMemorySource, load_into_memory, select_rows
+from robot.sources.in_memory import load_into_memory, select_rows
 from robot.sources.odometry import UNCORRECTED, correct_motions
 from tactile.base.plugins import PluginConfig
 from tactile.base.se2 import compose, fit_rigid_motion, integrate
@@ -38,18 +38,14 @@ VALUES = {"length_scale": 1.0, "turn_scale": 1.0, "heading_bias": 0.0}
 
 
 _Record = tuple[list[WheelFit], list[tuple[np.ndarray, ...]], RevisitFit | None]
-"""The wheels of a record: fitted on all of it and on each half; of each half, the paths of `_dead_reckon`
-with the fit of the other; from revisits, where the record was mapped."""
+"""The wheels of a record: fitted on all of it and on each half; of each half, its true path and the paths by
+odometry, as recorded and corrected by the fit of the other, [N, 3]; from revisits, where it was mapped."""
 _Rigs = tuple[dict[str, _Record], SignalRecord, SignalFit]
 """All records, and the whiskers of the arm."""
 
 
 def _measure(folder: Path) -> _Rigs:
-    """Fits all records below the folder of the real recordings.
-
-    Raises:
-        InputError: a record is missing or damaged.
-    """
+    """Fits all records below the folder of the real recordings."""
     require_recordings(folder, REACH, *(file for _, file in RECORDS.values()))
     records = {name: _measure_wheels(name, folder) for name in RECORDS}
     signals = read_signals_of_reach(
@@ -84,16 +80,13 @@ def _measure_wheels(name: str, folder: Path) -> _Record:
     for part in (log, *halves):
         assert part.truth is not None
         fits.append(fit_wheels(part.time, part.motion[:, :3], part.truth))
-    paths = [_dead_reckon(half, fit) for half, fit in zip(halves, fits[:0:-1], strict=True)]
+    paths = list[tuple[np.ndarray, ...]]()
+    for part, fit in zip(halves, fits[:0:-1], strict=True):
+        truth = np.asarray(part.truth)
+        known = np.isfinite(truth).all(axis=1)
+        ways = (correct_motions(each, part.motion[:, :3]) for each in (UNCORRECTED, fit.correction))
+        paths.append((truth[known], *(integrate(motion)[known] for motion in ways)))
     return fits, paths, fit_revisits(config) if name in MAPPED else None
-
-
-def _dead_reckon(log: InMemorySource, fit: WheelFit) -> tuple[np.ndarray, ...]:
-    """True path and the paths by odometry, as recorded and corrected by a fit, [N, 3] each."""
-    assert log.truth is not None
-    known = np.isfinite(log.truth).all(axis=1)
-    ways = (correct_motions(each, log.motion[:, :3]) for each in (UNCORRECTED, fit.correction))
-    return log.truth[known], *(integrate(motion)[known] for motion in ways)
 
 
 def _errors(records: dict[str, _Record]) -> np.ndarray:

@@ -61,11 +61,7 @@ _Likeness = tuple[list[_HeldOut], list[_HeldOut]]
 
 
 def _measure(folder: Path) -> _Likeness:
-    """Compares all held-out images.
-
-    Raises:
-        InputError: a recording is missing or damaged.
-    """
+    """Compares all held-out images."""
     objects, taxels = require_recordings(folder, OBJECTS, TAXELS)
     # The touches of all objects, in runs of 30; and an image of each contact, its mean pressures.
     views = [read_object(path)[0].reshape(-1, 128) for path in sorted(objects.glob("*.csv"))]

@@ -73,11 +73,7 @@ class _WalkResult(NamedTuple):
 
 
 def _measure(folder: Path) -> list[_WalkResult]:
-    """Five walks.
-
-    Raises:
-        InputError: a recording is missing or damaged.
-    """
+    """Five walks."""
     (objects,) = require_recordings(folder, OBJECTS)
     # The first mazes in which no object is needed more often than half of its rows.
     mazes: list[int] = []
