@@ -139,7 +139,7 @@ def _open_cycles(sessions: Sequence[str] | None, precisions: Sequence[Precision]
     """The compiled sessions of a table."""
     prepare_precision("float64")
     cycles = []
-    names = select_rows(sessions, SESSIONS, tuple(SESSIONS))
+    names = select_rows(sessions, SESSIONS)
     for name, backend, precision in product(names, BACKENDS, precisions):
         settings = [f"backend={backend}", f"session.precision={precision}"]
         config: RunConfig = load_config(SESSIONS[name], settings)

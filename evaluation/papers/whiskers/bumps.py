@@ -180,12 +180,9 @@ def _treat(name: str, observations: list[Observation], seed: int) -> list[Observ
         return correct_observations(OTHER_CREATES, observations)
     if name != "bumps shuffled in time":
         return observations
-    order = stream(seed, "shuffle").permutation(len(observations))
-    bumps = [observations[k] for k in order]
-    return [
-        each._replace(contact=bump.contact, point=bump.point)
-        for each, bump in zip(observations, bumps, strict=True)
-    ]
+    bumps = [observations[k] for k in stream(seed, "shuffle").permutation(len(observations))]
+    pairs = zip(observations, bumps, strict=True)
+    return [each._replace(contact=bump.contact, point=bump.point) for each, bump in pairs]
 
 
 def _run(
@@ -209,13 +206,11 @@ def _odometry_errors(observations: list[Observation], truth: np.ndarray) -> dict
         motion[pressed] *= [1 - slip, 1 - slip, 1 - slip / 2]
         return _ate(integrate(motion), truth)
 
-    corrected = correct_observations(OTHER_CREATES, observations)
+    corrected, drifts = correct_observations(OTHER_CREATES, observations), np.arange(-0.5, 0.5, 0.02)
     return {
         "odometry": error(),
         "odometry, turn scale fitted to the truth": min(error(turn=s) for s in np.arange(0.8, 1.3, 0.01)),
-        "odometry, heading drift fitted to the truth": min(
-            error(drift=d / 60) for d in np.arange(-0.5, 0.5, 0.02)
-        ),
+        "odometry, heading drift fitted to the truth": min(error(drift=d / 60) for d in drifts),
         "odometry without forward motion and half of the turn in pressed steps": error(slip=1.0),
         f"odometry, {OTHERS}": _ate(_dead_reckoning(corrected), truth),
     }
