@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from tactile.base.errors import InputError
-from tactile.base.samples import longest_run, robust_sd
+from tactile.base.samples import robust_sd, true_runs
 from tactile.base.settings import Settings
 from tactile.base.types import Cycle
 
@@ -38,42 +38,34 @@ _NORMAL_MEDIAN_SQUARE = 0.45493642311957283
 """Median of the square of a standard normal variable."""
 
 
-def window_variances(record: np.ndarray, lag: int = LAG, window: int = WINDOW) -> np.ndarray:
-    """The noise variance of each short window of a record, from differences between samples `lag` apart.
+def _noise_windows(record: np.ndarray, lag: int = LAG) -> tuple[np.ndarray, np.ndarray]:
+    """The noise variance of each short window of a record [T, ...], from differences between samples `lag`
+    apart: [J, ...] half their mean square; and [J, ...] bool, whether it is that of noise.
 
-    Windows overlap by half; window j is of the `window + lag` samples from sample j * (window // 2) on.
-
-    Args:
-        record: [T, ...] samples. lag: samples between the two of a difference. window: differences in a
-            window.
-
-    Returns:
-        [J, ...] half the mean square of the differences of each window.
+    Windows overlap by half; window j is of the `WINDOW + lag` samples from sample j * (WINDOW // 2) on.
 
     Raises:
         InputError: the record is shorter than one window, or has NaN or infinite samples.
     """
-    record = np.asarray(record, float)
-    if len(record) < lag + window:
-        found = f"a record of {len(record)} samples"
-        raise InputError("noise", found, f"at least {lag + window} samples", "record for longer")
-    if not np.isfinite(record).all():
-        raise InputError("noise", "NaN or infinite samples", "finite samples", "leave these channels out")
+    record = _finite("noise", record, lag + WINDOW)
     square = (record[lag:] - record[:-lag]) ** 2
-    windows = np.lib.stride_tricks.sliding_window_view(square, window, axis=0)[:: max(window // 2, 1)]
-    return windows.mean(axis=-1) / 2
+    windows = np.lib.stride_tricks.sliding_window_view(square, WINDOW, axis=0)[:: WINDOW // 2]
+    variances = windows.mean(axis=-1) / 2
+    return variances, variances <= QUIET_RATIO * np.quantile(variances, QUIET, axis=0)
 
 
-def quiet_windows(variances: np.ndarray) -> np.ndarray:
-    """[J, ...] bool, the windows whose variance is that of noise, by channel.
+def _finite(where: str, record: np.ndarray, least: int) -> np.ndarray:
+    """A record as floats; an `InputError` of fewer than `least` samples, or of NaN or infinite ones."""
+    record = np.asarray(record, float)
+    if len(record) < least:
+        found = f"a record of {len(record)} samples"
+        raise InputError(where, found, f"at least {least} samples", "record for longer")
+    if not np.isfinite(record).all():
+        raise InputError(where, "NaN or infinite samples", "finite samples", "leave these channels out")
+    return record
 
-    Args:
-        variances: [J, ...] from `window_variances`.
-    """
-    return variances <= QUIET_RATIO * np.quantile(variances, QUIET, axis=0)
 
-
-def estimate_noise(record: np.ndarray, lag: int = LAG, window: int = WINDOW) -> np.ndarray:
+def estimate_noise(record: np.ndarray, lag: int = LAG) -> np.ndarray:
     """The standard deviation of the noise of each channel.
 
     The mean variance of the quiet windows. Coloured noise counts in full if its correlation is gone after
@@ -83,7 +75,6 @@ def estimate_noise(record: np.ndarray, lag: int = LAG, window: int = WINDOW) -> 
 
     Args:
         record: [T, ...] samples, in any unit. lag: samples after which the noise is uncorrelated.
-            window: differences in a window; a few times `lag`.
 
     Returns:
         [...] standard deviations, in the record's unit; 0 for a constant channel.
@@ -91,8 +82,7 @@ def estimate_noise(record: np.ndarray, lag: int = LAG, window: int = WINDOW) -> 
     Raises:
         InputError: the record is shorter than one window, or has NaN or infinite samples.
     """
-    variances = window_variances(record, lag, window)
-    quiet = quiet_windows(variances)
+    variances, quiet = _noise_windows(record, lag)
     return np.sqrt((variances * quiet).sum(axis=0) / quiet.sum(axis=0))
 
 
@@ -114,13 +104,8 @@ def estimate_drift(record: np.ndarray, block: int = 100) -> np.ndarray:
     Raises:
         InputError: the record is shorter than eight blocks, or has NaN or infinite samples.
     """
-    record = np.asarray(record, float)
+    record = _finite("drift", record, 8 * block)
     count = len(record) // block
-    if count < 8:
-        found = f"a record of {len(record)} samples"
-        raise InputError("drift", found, f"at least {8 * block} samples", "record for longer")
-    if not np.isfinite(record).all():
-        raise InputError("drift", "NaN or infinite samples", "finite samples", "leave these channels out")
     means = record[: count * block].reshape(count, block, *record.shape[1:]).mean(axis=1)
     one, two = (np.median((means[gap:] - means[:-gap]) ** 2, axis=0) for gap in (1, 2))
     return np.sqrt(np.maximum(two - one, 0.0) / _NORMAL_MEDIAN_SQUARE / block)
@@ -193,7 +178,7 @@ def calibrate_free(config: DirtyRecordConfig, record: np.ndarray, where: str = "
         raise _dirty_error(where, dirty, "record again with nothing within reach, or set on_dirty: repair")
     usual = np.median(noise, axis=0)
     for whisker, reason in dirty.items():
-        rows = clean_stretch(record[:, whisker], config.max_ratio * usual)
+        rows = _clean_stretch(record[:, whisker], config.max_ratio * usual)
         if rows is None:
             hopeless = {whisker: f"{reason}, and it has no clean stretch"}
             raise _dirty_error(where, hopeless, "record again with nothing within reach")
@@ -202,24 +187,20 @@ def calibrate_free(config: DirtyRecordConfig, record: np.ndarray, where: str = "
     return FreeBaseline(mean, noise, dirty)
 
 
-def clean_stretch(record: np.ndarray, limit: np.ndarray) -> slice | None:
-    """The longest stretch of one whisker's record in which all windows are quiet.
+def _clean_stretch(record: np.ndarray, limit: np.ndarray) -> slice | None:
+    """The longest stretch of one whisker's record [T, K] in which all windows are quiet, with a noise of at
+    most `limit` [K]; None if no window is.
 
     A whisker that is pressed steadily looks free; where it is pressed for the longer part of the record, the
     stretch is of the press.
-
-    Args:
-        record: [T, K] samples. limit: [K] largest noise of a quiet window.
-
-    Returns:
-        The rows, or None if no window is quiet.
     """
-    variances = window_variances(record)
-    quiet = np.all(quiet_windows(variances) & (variances <= limit**2), axis=-1)
+    variances, quiet = _noise_windows(record)
+    quiet = np.all(quiet & (variances <= limit**2), axis=-1)
     if not quiet.any():
         return None
-    run = longest_run(quiet)
-    return slice(run.start * (WINDOW // 2), (run.stop - 1) * (WINDOW // 2) + WINDOW + LAG)
+    runs = true_runs(quiet)
+    first, end = runs[np.argmax(runs[:, 1] - runs[:, 0])].tolist()  # the first of the longest ones
+    return slice(first * (WINDOW // 2), (end - 1) * (WINDOW // 2) + WINDOW + LAG)
 
 
 def _dirty_error(where: str, dirty: Mapping[int, str], cure: str) -> InputError:

@@ -49,7 +49,7 @@ class ContactStreamConfig(Settings):
     block: PositiveFloat = 0.05
     """Interval at which baselines change, s."""
     bent_time: PositiveFloat = 30.0
-    """A whisker that stays away from its baseline for this long while its base moves counts as bent, s."""
+    """A whisker that stays away from its baseline for this long counts as bent, s."""
 
 
 class Touch(IntEnum):
@@ -92,7 +92,7 @@ class StreamState(NamedTuple):
         row: samples so far in this block. recent: [window - 1, W, K] last samples.
         baseline: [W, K]. home: [W, K] slow baseline; of a bent whisker, that before it was bent.
         contact, bent: [W] bool. allowance: [W] departure that creep and drift explain, in noise.
-        held: [W] samples of contact so far. away: [W] of these, while the base moved.
+        held: [W] samples of contact so far. away: [W] of these, since its baseline was last moved to it.
         total, touched, largest: of this block, [W, K] sum of the deviations, [W] whether there was a contact,
             [W] departure in contact.
     """
@@ -141,23 +141,21 @@ def start_stream(
 
 
 def find_contacts(
-    plan: StreamPlan, state: StreamState, samples: np.ndarray, moving: np.ndarray | None = None
+    plan: StreamPlan, state: StreamState, samples: np.ndarray
 ) -> tuple[StreamState, np.ndarray]:
     """The state of each whisker at each sample.
 
     Args:
-        samples: [T, W, K] the next samples. moving: [T] bool, whether the base of the whiskers moves; None if
-            it always does.
+        samples: [T, W, K] the next samples.
 
     Returns:
         The state after the samples, and [T, W] int8, a `Touch` each.
     """
     touch = np.empty(samples.shape[:2], np.int8)
-    moves = np.ones(len(samples), bool) if moving is None else moving
     first = 0
     while first < len(samples):
         last = min(first + plan.block - state.row, len(samples))
-        state, contact = _continue_block(plan, state, samples[first:last], moves[first:last])
+        state, contact = _continue_block(plan, state, samples[first:last])
         touch[first:last] = np.where(contact, Touch.CONTACT, np.where(state.bent, Touch.BENT, Touch.FREE))
         if state.row == plan.block:
             state = _end_block(plan, state)
@@ -191,7 +189,7 @@ def find_fixed_contacts(free: np.ndarray, samples: np.ndarray, sds: float = 20.0
 
 
 def _continue_block(
-    plan: StreamPlan, state: StreamState, samples: np.ndarray, moving: np.ndarray
+    plan: StreamPlan, state: StreamState, samples: np.ndarray
 ) -> tuple[StreamState, np.ndarray]:
     """Decides samples within a block. Returns [T, W] bool, contact."""
     known = np.concatenate([state.recent, samples])
@@ -215,23 +213,18 @@ def _continue_block(
     latest = np.where(begins | (departure < plan.off + state.allowance), np.arange(len(begins))[:, None], -1)
     latest = np.maximum.accumulate(latest, axis=0)
     contact = np.where(latest >= 0, np.take_along_axis(begins, np.maximum(latest, 0), axis=0), state.contact)
-    return _count_contacts(later, contact, departure, moving), contact
-
-
-def _count_contacts(
-    state: StreamState, contact: np.ndarray, departure: np.ndarray, moving: np.ndarray
-) -> StreamState:
-    """The state after contacts [T, W]: how long they have lasted and how far they went."""
-    row = np.arange(1, len(contact) + 1)
+    # How long the contacts have lasted, from the last free sample on, and how far they went.
+    row = np.arange(1, count + 1)
     free = np.where(contact, 0, row[:, None]).max(axis=0)
-    steps = np.concatenate([[0], np.cumsum(moving)])
-    return state._replace(
+    held, away = (np.where(free, count - free, before + count) for before in (state.held, state.away))
+    later = later._replace(
         contact=contact[-1],
-        held=np.where(free, row[-1] - free, state.held + row[-1]),
-        away=np.where(free, steps[-1] - steps[free], state.away + steps[-1]),
+        held=held,
+        away=away,
         touched=state.touched | contact.any(axis=0),
         largest=np.maximum(state.largest, np.where(contact, departure, 0.0).max(axis=0)),
     )
+    return later, contact
 
 
 def _end_block(plan: StreamPlan, state: StreamState) -> StreamState:

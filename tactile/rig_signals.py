@@ -47,29 +47,23 @@ RADII = (0.3, 3.0)
 Predict = Callable[[HeadConfig], np.ndarray]
 """Protractions [T, W] (rad) at which a head meets the walls around it at the T poses of the record; infinite
 without contact."""
+Measured = tuple[float, float]
+"""A quantity and its standard deviation."""
 
 
-class HeadFit(NamedTuple):
-    """A head's geometry, as (value, standard deviation).
-
-    Attributes:
-        rest_deg: degrees. radius: of each ring, m; None for a ring without enough contacts against edges or
-            none at all. contacts: their number. error: robust standard deviation of a protraction with this
-            geometry, and with the assumed one, rad.
-    """
-
-    rest_deg: tuple[float, float]
-    radius: tuple[tuple[float, float] | None, ...]
-    contacts: int
-    error: tuple[float, float]
-
-
-def fit_head(assumed: HeadConfig, contact: np.ndarray, angle: np.ndarray, predict: Predict) -> HeadFit:
+def fit_head(
+    assumed: HeadConfig, contact: np.ndarray, angle: np.ndarray, predict: Predict
+) -> tuple[Measured, tuple[Measured | None, ...], int, tuple[float, float]]:
     """The geometry of a head.
 
     Args:
         assumed: geometry to start from; its lengths, heights and directions are kept.
         contact: [T, W] bool. angle: [T, W] protraction at first contact, rad. predict: see `Predict`.
+
+    Returns:
+        rest angle, degrees. radius of each ring, m; None for a ring without enough contacts against edges or
+        none at all. number of contacts. robust standard deviation of a protraction with this geometry, and
+        with the assumed one, rad.
 
     Raises:
         InputError: fewer than `LEAST_CONTACTS` contacts.
@@ -105,7 +99,7 @@ def fit_head(assumed: HeadConfig, contact: np.ndarray, angle: np.ndarray, predic
         (float(value), float(one)) if one < value else None
         for value, one in zip(values[1:], sd[1:], strict=True)
     )
-    return HeadFit((float(values[0]), float(sd[0])), radii, len(row), (after, assumed_error))
+    return (float(values[0]), float(sd[0])), radii, len(row), (after, assumed_error)
 
 
 def head_with(assumed: HeadConfig, values: np.ndarray) -> HeadConfig:

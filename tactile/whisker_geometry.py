@@ -105,15 +105,10 @@ def shaft_points(head: Head, angle: Array, along: Array) -> np.ndarray:
     return head.base + along * (np.cos(angle) * head.rest + np.sin(angle) * head.swing)
 
 
-def tip_points(head: Head, angle: Array) -> np.ndarray:
-    """Positions [..., W, 3] (m) of the tips at protractions [..., W] (rad)."""
-    return shaft_points(head, angle, head.length)
-
-
 def tip_height(head: Head, angle: Array) -> np.ndarray:
     """Heights [..., W] of the tips above the floor, m: about the height of an obstacle touched there (Salman
     & Pearson 2016, III-D)."""
-    return tip_points(head, angle)[..., 2]
+    return shaft_points(head, angle, head.length)[..., 2]
 
 
 class PlanarWhiskers(NamedTuple):

@@ -57,7 +57,19 @@ def add_commands(commands: Commands) -> None:
     names = Commands(reproduce)
     for paper, figures in (("Salman & Pearson", SALMAN2016), ("Fox et al.", FOX2012)):
         for name, title in figures.items():
-            _add_figure(names, name, f"{paper}: {title}")
+            parser = names.add(name, _figure, f"{paper}: {title}", f"reproduce {name} --sets 1")
+            add_count(parser, "--sets", SETS.get(name, USUAL_SETS), "mazes or trials per condition")
+            parser.add_argument(
+                "--seed", type=int, default=0, metavar="S", help="seed of all sets (default 0)"
+            )
+            parser.add_argument(
+                "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
+                check=own_folder(*(f"{figure}.csv" for figure in SALMAN2016 | FOX2012)),
+                help=f"folder for {name}.csv and {name}.png (default runs/reproduce)",
+            )  # fmt: skip
+            add_set(parser)
+            add_workers(parser)
+            parser.set_defaults(name=name)
     threshold = names.add(
         "threshold", _threshold, "Salman & Pearson: threshold tuning, classic method",
         "reproduce threshold whisker_maze -o runs/threshold",
@@ -132,22 +144,6 @@ def _add_row_names(parser: argparse.ArgumentParser, rows: Iterable[str]) -> None
     parser.add_argument("--rows", nargs="+", metavar="ROW", help=f"only these of: {listed} (default: all)")
 
 
-def _add_figure(names: Commands, name: str, title: str) -> None:
-    """Registers a figure."""
-    parser = names.add(name, _figure, title, f"reproduce {name} --sets 1")
-    sets = SETS.get(name, USUAL_SETS)
-    add_count(parser, "--sets", sets, "mazes or trials per condition")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of all sets (default 0)")
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
-        check=own_folder(*(f"{figure}.csv" for figure in SALMAN2016 | FOX2012)),
-        help=f"folder for {name}.csv and {name}.png (default runs/reproduce)",
-    )  # fmt: skip
-    add_set(parser)
-    add_workers(parser)
-    parser.set_defaults(name=name)
-
-
 def _figure(arguments: argparse.Namespace) -> int:
     if arguments.seed < 0:
         raise InputError("--seed", str(arguments.seed), "a non-negative integer")
@@ -159,41 +155,35 @@ def _figure(arguments: argparse.Namespace) -> int:
     from evaluation.papers.paper_sets import reproduce
 
     name, folder = arguments.name, arguments.output
-    text, interrupted = reproduce(
-        PAPER,
-        name,
-        folder,
-        sets=arguments.sets,
-        workers=arguments.workers,
-        seed=arguments.seed,
-        assignments=arguments.set,
-    )
+    sets, workers, seed = arguments.sets, arguments.workers, arguments.seed
+    text, interrupted = reproduce(PAPER, name, folder, sets, workers, seed, arguments.set)
     print(f"{text}\n\nwrote {folder / name}.csv" + ("" if interrupted else f" and {folder / name}.png"))
     return INTERRUPTED if interrupted else 0
 
 
 def _threshold(arguments: argparse.Namespace) -> int:
     prepare_jax(keep_compiled=False)
-    from evaluation.papers.salman2016.threshold_tuning import render_tuning, save_tuning, tune_threshold
+    from evaluation.papers.salman2016.threshold_tuning import tune_threshold
     from ratslam.runs.settings.strict_yaml import load, override
 
     path = find_config(arguments.config)
-    tuning = tune_threshold(override(load(path), arguments.set), path.parent, arguments.workers)
-    print(render_tuning(tuning))
-    if arguments.output:
-        plot, table = save_tuning(tuning, arguments.output)
-        print(f"\nwrote {plot} and {table}")
+    document = override(load(path), arguments.set)
+    for line in tune_threshold(document, path.parent, arguments.workers, arguments.output):
+        print(line)
     return 0
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from evaluation.papers.fox2012.template_training import drive_held_out, render_drives, train_to_file
+    from evaluation.papers.fox2012.template_training import drive_held_out, render_drives
+    from robot.simulation.create.simulated_session import train_strain_templates
 
     create_simulation = read_config(arguments).create_simulation
     if create_simulation is None:
         where, cure = f"{arguments.config}: create_simulation", "`create_simulation: {}` gives the default"
         raise InputError(where, "missing", "the Create to train", cure)
-    templates = train_to_file(create_simulation, arguments.output)
+    templates = train_strain_templates(create_simulation)
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    templates.write(arguments.output)
     print(render_drives(drive_held_out(create_simulation, templates), templates.training.repeats))
     print(f"\nwrote {arguments.output}; `touch.reports.templates: {arguments.output}` uses it")
     return 0
@@ -202,8 +192,7 @@ def _train(arguments: argparse.Namespace) -> int:
 def _figures(arguments: argparse.Namespace) -> int:
     """The figures of pose cells, or those of real recordings."""
     from evaluation.papers.tables.markdown import select_rows
-    from evaluation.papers.tables.recordings import DATA, real_recordings
-    from evaluation.papers.whiskers.recordings import UNPROVEN
+    from evaluation.papers.tables.recordings import DATA, UNPROVEN, real_recordings
 
     if arguments.page == "cells":
         task: object = Task(arguments.first, arguments.sessions, arguments.workers)
@@ -213,7 +202,7 @@ def _figures(arguments: argparse.Namespace) -> int:
         if task is None:
             raise InputError(DATA, "not set", "the folder of the real recordings", f"export {DATA}=DIR")
     prepare_jax(keep_compiled=False)
-    names = select_rows(arguments.rows, places, tuple(places))
+    names = select_rows(arguments.rows, places)
 
     def measure(name: str, figure: Figure) -> tuple[Sequence[str], Any]:
         return (), figure.measure(task)
@@ -230,17 +219,11 @@ def _maps(arguments: argparse.Namespace) -> int:
     from evaluation.papers.maps.operations import Methods, reproduce_maps
     from evaluation.papers.tables.markdown import select_rows
 
-    names = select_rows(arguments.rows, MAPS, tuple(MAPS))
-    lines = reproduce_maps(
-        names,
-        Methods(),
-        arguments.output,
-        arguments.first,
-        arguments.sessions,
-        arguments.workers,
-        arguments.against,
-    )
-    for line in lines:
+    names = select_rows(arguments.rows, MAPS)
+    first, sessions, workers = arguments.first, arguments.sessions, arguments.workers
+    for line in reproduce_maps(
+        names, Methods(), arguments.output, first, sessions, workers, arguments.against
+    ):
         print(line, flush=True)
     print(f"wrote {arguments.output / 'maps.md'} and {arguments.output / 'maps.csv'}")
     return 0
@@ -340,14 +323,13 @@ def _print_table(arguments: argparse.Namespace) -> int:
 
 def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
     """The lines of a table, each as soon as it is measured; only the modules of that table are loaded."""
-    from evaluation.papers.tables.comparison import Files
     from evaluation.papers.tables.markdown import select_rows
 
     if name == "touch":
         from evaluation.papers.tables import touch_table as touch
 
         rows = select_rows(arguments.rows, touch.ROWS, touch.DEFAULT_ROWS)
-        files = Files(arguments.output, arguments.against)
+        files = arguments.output, arguments.against
         first, sessions = arguments.first, arguments.sessions
         return touch.touch_table(rows, first, sessions, arguments.workers, arguments.backend, files)
     if name == "grid":
@@ -363,9 +345,9 @@ def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
 
         copies, workers = arguments.copies, arguments.workers
         if name == "laser":
-            rows = select_rows(arguments.rows, buildings.ROWS, tuple(buildings.ROWS))
+            rows = select_rows(arguments.rows, buildings.ROWS)
             return buildings.laser_table(rows, copies, workers)
-        files = Files(arguments.output, arguments.against)
+        files = arguments.output, arguments.against
         return buildings.buildings_table(buildings.choose_rows(arguments.rows), copies, workers, files=files)
     if name == "health":
         from evaluation.papers.tables.health import health_table

@@ -33,7 +33,7 @@ CELLS = {
 """Pose cells: the first nine are measured on `backend: classic`, the others on `backend: recall`."""
 REAL = {
     name: f"whiskers.{name}.FIGURE"
-    for name in ("contact", "drift", "fit", "tangent", "likeness", "walk", "create", "bumps")
+    for name in ("contact", "drift", "fit", "likeness", "walk", "create", "bumps")
 }
 """Recordings of real whiskers and wheels."""
 MAPS = {
@@ -76,10 +76,11 @@ class Figure(NamedTuple):
 
     Attributes:
         title: one line. measure: the result: of a `Task` (pose cells), of the folder of the real recordings
-            (real whiskers), of one session (saved maps). table: the lines of a Markdown table of the result,
-            or of the results of all sessions, each figure beside its control, and sentences about what it
-            does not show. draw: draws the same into a new PNG file; None: without a picture. sessions: of
-            saved maps: their usual number, or the names of the recordings that are used instead of mazes.
+            (real whiskers; an `InputError` if one is missing or damaged), of one session (saved maps). table:
+            the lines of a Markdown table of the result, or of the results of all sessions, each figure beside
+            its control, and sentences about what it does not show. draw: draws the same into a new PNG file;
+            None: without a picture. sessions: of saved maps: their usual number, or the names of the
+            recordings that are used instead of mazes.
     """
 
     title: str

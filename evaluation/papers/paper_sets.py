@@ -76,7 +76,6 @@ def reproduce(
     paper: Paper,
     name: str,
     directory: Path,
-    *,
     sets: int = 3,
     workers: int = 0,
     seed: int = 0,

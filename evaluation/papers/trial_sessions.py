@@ -211,7 +211,13 @@ def run_recording(config: RunConfig, perturbation: Perturbation | None = None, s
 
 def closure_claims(run: RecordingRun) -> ClosureClaims:
     """The claims of all candidates in closures.csv that belong to a sequence."""
-    rows = [row for row in _closure_rows(run.session) if int(row["sequence"]) >= 0]
+    rows = list[dict[str, str]]()
+    if (write := run.session.map.files().get("closures.csv")) is not None:
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "closures.csv"
+            write(path)
+            table = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+        rows = [row for row in table if int(row["sequence"]) >= 0]
     step, match, shift, sequence = (
         np.array([int(row[name]) for row in rows], int)
         for name in ("step", "match_step", "shift", "sequence")
@@ -227,17 +233,6 @@ def closure_claims(run: RecordingRun) -> ClosureClaims:
     )
 
 
-def _closure_rows(session: Session) -> list[dict[str, str]]:
-    """The rows of closures.csv by column; none for a map without that file."""
-    write = session.map.files().get("closures.csv")
-    if write is None:
-        return []
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "closures.csv"
-        write(path)
-        return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-
-
 class ArenaSession(NamedTuple):
     """A session of T reports.
 
@@ -250,19 +245,6 @@ class ArenaSession(NamedTuple):
     arena: Arena
     truth: np.ndarray
     odometry: np.ndarray
-
-
-class FilterResult(NamedTuple):
-    """The result of a filter after T reports, in the frame of the arena.
-
-    Attributes:
-        online: [T, 3] poses as estimated at the time. path: [T, 3] final poses. grid: the map drawn along
-            `path`.
-    """
-
-    online: np.ndarray
-    path: np.ndarray
-    grid: OccupancyGrid
 
 
 def simulate_session(config: CreateSimulationConfig) -> ArenaSession:
@@ -301,8 +283,9 @@ def observe_session(config: RunConfig, session: ArenaSession, seed: int) -> list
 
 def run_filter(
     config: RunConfig, session: ArenaSession, reports: list[Observation], stops: tuple[int, ...]
-) -> list[FilterResult]:
-    """The result of the configured filter after each number of reports in `stops`."""
+) -> list[tuple[np.ndarray, np.ndarray, OccupancyGrid]]:
+    """The result of the configured filter after each number of reports in `stops`, in the frame of the arena:
+    poses [T, 3] as estimated at the time, final poses [T, 3], and the map drawn along these."""
     touch = report_config_of(session.source.info, config.touch.reports)
     grid = config.grid
     if grid.side is None:
@@ -316,7 +299,7 @@ def run_filter(
         online += [step.pose for step in slam.replay(reports[len(online) : stop])]
         path = compose(start, slam.map.trajectory())
         drawn = draw_map(grid, touch.feelers, session.arena, path, marks)
-        found.append(FilterResult(compose(start, np.array(online)), path, drawn))
+        found.append((compose(start, np.array(online)), path, drawn))
     return found
 
 

@@ -273,14 +273,14 @@ def _fit_head(config: RunConfig, samples: list[Sample], info: SourceInfo) -> Rig
 
     contact, angle = (np.array([getattr(whisk, name) for whisk in whisks]) for name in ("contact", "touched"))
     try:
-        fit = fit_head(assumed, contact, angle, predict)
+        (rest, sd), radius_of, contacts, errors = fit_head(assumed, contact, angle, predict)
     except InputError as error:
         return Rig(unknown=(f"rest angle, base radii: {error.found}; {error.expected} are needed",))
     # Rings whose radius is unknown keep theirs.
-    rest, sd = min(fit.rest_deg[0], STEEPEST_REST), fit.rest_deg[1]
+    rest = min(rest, STEEPEST_REST)
     quantities = [Quantity("rest angle", assumed.rest_deg, rest, sd, "degrees", "touch.head.rest_deg")]
     unknown, radii = [], []
-    for number, (ring, radius) in enumerate(zip(assumed.rings, fit.radius, strict=True)):
+    for number, (ring, radius) in enumerate(zip(assumed.rings, radius_of, strict=True)):
         radii.append(ring.radius if radius is None else radius[0])
         if radius is None:
             unknown.append(f"radius of ring {number}: too few of its contacts are against edges")
@@ -289,8 +289,8 @@ def _fit_head(config: RunConfig, samples: list[Sample], info: SourceInfo) -> Rig
     found = head_with(assumed, np.array([rest, *radii]))
     rings = [{key: float(f"{value:.6g}") for key, value in ring.model_dump().items()} for ring in found.rings]
     note = (
-        f"head: {fit.contacts} contacts; their protractions err by {1e3 * fit.error[0]:.1f} mrad, "
-        f"{1e3 * fit.error[1]:.1f} with the head assumed; the radii are set in touch.head.rings"
+        f"head: {contacts} contacts; their protractions err by {1e3 * errors[0]:.1f} mrad, "
+        f"{1e3 * errors[1]:.1f} with the head assumed; the radii are set in touch.head.rings"
     )
     settings = {"touch": {"head": {"rings": rings}}}
     return Rig(tuple(quantities), settings, (note, DELAY), tuple(unknown))
@@ -323,7 +323,7 @@ def _fit_stage(source: PluginConfig) -> Rig:
             known = fit_signal_map(position[~fold], signal[~fold], base)
             for out, mean in zip(
                 errors,
-                (known.predict(position[fold]), signal[~fold].mean(axis=0)),
+                (known(position[fold]), signal[~fold].mean(axis=0)),
                 strict=True,
             ):
                 out[fold] = np.sqrt(((signal[fold] - mean) ** 2).mean(axis=1))

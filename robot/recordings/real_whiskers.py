@@ -27,7 +27,6 @@ from robot.sources.input_files import digest_of, missing_error, raise_errors, re
 from robot.sources.odometry import from_motions
 from robot.sources.source import Source, SourceEntry, SourceInfo
 from tactile.base.errors import InputError
-from tactile.base.samples import longest_run
 from tactile.base.settings import Settings
 from tactile.calibration import DirtyRecordConfig, calibrate_free
 from tactile.contact_stream import ContactStreamConfig, Touch, find_contacts, start_stream
@@ -249,16 +248,6 @@ def read_stage(path: Path) -> StageRecording:
     """
     table, digest = read_columns(path, ("", "px", "py", "pz", "sx", "sy", "sz"))  # the index has no name
     return StageRecording(table[:, 1:4] * 1e-3, table[:, 4:], digest)
-
-
-def cut_sweep(recording: StageRecording) -> StageRecording:
-    """The longest stretch of even steps: without the way to the start, and the row of zeros there."""
-    step = np.linalg.norm(np.diff(recording.position, axis=0), axis=1)
-    usual = np.median(step)
-    even = (step <= 3.0 * usual) & (step >= usual / 3.0)
-    run = longest_run(even)
-    rows = slice(run.start, run.stop + 1) if even.any() else slice(None)
-    return recording._replace(position=recording.position[rows], signal=recording.signal[rows])
 
 
 def read_stage_calibration(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

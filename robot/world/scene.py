@@ -38,7 +38,7 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 from tactile.base.settings import Settings
-from tactile.whisker_geometry import Head, tip_points
+from tactile.whisker_geometry import Head, tip_height
 
 
 class JitterConfig(Settings):
@@ -280,7 +280,7 @@ def _check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surrounding
         expected = f"less than {hangs:g} m, the height of the head"
         raise InputError("simulation.maze.heights", f"a wall of {tallest:g} m", expected)
     surroundings = Surroundings(boxes, head)
-    if tip_points(head, np.zeros(len(head.length)))[:, 2].min() > tallest:
+    if tip_height(head, np.zeros(len(head.length))).min() > tallest:
         return surroundings  # at rest, whiskers are above all walls
     # Times (s) along a path with a motion of at most `POSE_STEP` in between.
     step = np.abs(np.diff(path.pose, axis=0))

@@ -15,10 +15,3 @@ def true_runs(which: np.ndarray) -> np.ndarray:
     """[R, 2] first index and end (exclusive) of each run of true values of [N] bool, in order."""
     edges = np.diff(np.concatenate([[False], which, [False]]).astype(np.int8))
     return np.flatnonzero(edges).reshape(-1, 2)
-
-
-def longest_run(which: np.ndarray) -> slice:
-    """The first of the longest runs of true values of [N] bool; empty if none is true."""
-    runs = true_runs(which)
-    first, end = runs[np.argmax(runs[:, 1] - runs[:, 0])].tolist() if len(runs) else (0, 0)
-    return slice(first, end)

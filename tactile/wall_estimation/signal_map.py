@@ -3,16 +3,15 @@
 A stage moves a contact to known positions in the whisker's frame and records the signals there. The map is a
 Gaussian process (Rasmussen and Williams 2006, ch. 2): a Matérn kernel of order 5/2 on top of a linear trend,
 one for all channels, over direction and distance from the whisker's base, in which signals vary evenly (in
-Cartesian coordinates they vary much faster near the base). It says how sure it is, so that an estimator can
-tell interpolation from guessing beyond the calibrated region.
+Cartesian coordinates they vary much faster near the base).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_solve, cholesky
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
@@ -33,68 +32,14 @@ LEAST, MOST = (0.1, 0.1, 1e-3), (5.0, 20.0, 1.0)
 OUTLIER_ROUNDS = 3
 """Rounds of leaving rows out."""
 
-
-class SignalMap(NamedTuple):
-    """A map from contact positions to C signals, from N calibration rows.
-
-    Attributes:
-        position: [N, 3] m. base: [3] m, the whisker's base. length: [2] length scales of the process: of
-            direction, rad, and of distance, m. noise: repeatability, as a share of the signals' size.
-        offset, scale: [C] mean and amplitude of the signals. factor: [N, N] lower Cholesky factor of the
-            covariance; weight: [N, C].
-        left_out: rows of the calibration that contradict their neighbours, as where a whisker slips off.
-    """
-
-    position: np.ndarray
-    base: np.ndarray
-    length: np.ndarray
-    noise: float
-    offset: np.ndarray
-    scale: np.ndarray
-    factor: np.ndarray
-    weight: np.ndarray
-    left_out: np.ndarray
-
-    def predict(self, position: np.ndarray) -> np.ndarray:
-        """The signals [M, C] expected at positions [M, 3], m."""
-        between = _covariance(*self._both(position))
-        signal: np.ndarray = self.offset + self.scale * (between @ self.weight)
-        return signal
-
-    def variance(self, position: np.ndarray) -> np.ndarray:
-        """Variances [M, C] of the map's errors at positions [M, 3]; large beyond the calibration."""
-        there, here = self._both(position)
-        solved = solve_triangular(self.factor, _covariance(here, there), lower=True)
-        prior = 1.0 + TREND**2 * (1.0 + (there**2).sum(axis=1))
-        share = np.maximum(prior - (solved**2).sum(axis=0), 0.0)
-        variance: np.ndarray = share[:, None] * self.scale**2
-        return variance
-
-    def slope(self, position: np.ndarray) -> np.ndarray:
-        """The derivatives [M, C, 3] of the expected signals by position, 1/m."""
-        there, here = self._both(position)
-        distance = np.sqrt(5.0) * cdist(there, here)
-        radial = -5.0 / 3.0 * (1.0 + distance) * np.exp(-distance)
-        # The sum over rows n of radial[m, n] (there[m] - here[n]) weight[n], plus the trend's slope.
-        moment = (self.weight[:, :, None] * here[:, None, :]).reshape(len(here), -1)
-        slope = (radial @ self.weight)[:, :, None] * there[:, None, :]
-        slope -= (radial @ moment).reshape(slope.shape)
-        slope = (slope + TREND**2 * (self.weight.T @ here)) * self.scale[:, None]
-        away = position - self.base
-        reach = np.linalg.norm(away, axis=1)[:, None, None]
-        ahead = away[:, None, :] / reach
-        turn = (np.eye(3) - ahead.swapaxes(1, 2) * ahead) / reach / self.length[0]
-        result: np.ndarray = slope @ np.concatenate([turn, ahead / self.length[1]], axis=1)
-        return result
-
-    def _both(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Features of positions [M, 3] and of the calibration's."""
-        here = _features(self.position - self.base, self.length)
-        return _features(position - self.base, self.length), here
+SignalMap = Callable[[np.ndarray], np.ndarray]
+"""The signals [M, C] expected of contacts at positions [M, 3], m."""
 
 
 def fit_signal_map(position: np.ndarray, signal: np.ndarray, base: np.ndarray) -> SignalMap:
     """Learns the map; length scales and noise are the most likely ones.
+
+    Rows that contradict their neighbours, as where a whisker slips off, are left out.
 
     Args:
         position: [N, 3] contact positions, m, none of them at the base. signal: [N, C] signals above
@@ -130,9 +75,15 @@ def fit_signal_map(position: np.ndarray, signal: np.ndarray, base: np.ndarray) -
     factor = _factor(where[use], noise * share[use])
     weight = cho_solve((factor, True), value[use])
     amplitude = np.sqrt((value[use] * weight).mean(axis=0))
-    scale = scale * amplitude
-    left_out = np.flatnonzero(~use)
-    return SignalMap(position[use], base, length, noise, offset, scale, factor, weight / amplitude, left_out)
+    # Amplitudes belong to the scale of the signals: weights are those of a process of variance 1.
+    scale, weight = scale * amplitude, weight / amplitude
+    known = _features(position[use] - base, length)
+
+    def predict(position: np.ndarray) -> np.ndarray:
+        between = _covariance(_features(position - base, length), known)
+        return np.asarray(offset + scale * (between @ weight))
+
+    return predict
 
 
 def _features(away: np.ndarray, length: np.ndarray) -> np.ndarray:

@@ -185,7 +185,7 @@ def measure_lesions(
 ) -> _Lesions:
     """The figures of the sessions of all lesions, `INTACT` among them; those on Intel where it is at hand."""
     tasks = [(lesion, row, maze) for row in rows for maze in task.seeds(USUAL) for lesion in lesions]
-    if not INTEL.missing(Path()):
+    if not INTEL.missing():
         tasks += [(lesion, "", task.first) for lesion in lesions if lesion != EXCHANGED]
     runs = dict(zip(tasks, run_tasks(_run_lesion, tasks, workers=task.workers), strict=True))
     found: dict[tuple[str, str], list[_Lesioned]] = {}
@@ -205,7 +205,7 @@ def _run_lesion(task: tuple[str, str, int]) -> tuple[SessionFigures | None, set[
         functions = LESIONS[lesion](maze)
     with replaced(functions):
         if not row:
-            claims = closure_claims(run_recording(INTEL.configuration(Path())))
+            claims = closure_claims(run_recording(INTEL.configuration()))
             true = int((claims.accepted & (claims.distance <= FALSE_DISTANCE)).sum())
             return None, {(step,) for step in np.flatnonzero(claims.accepted).tolist()}, true
         result, figures = run_and_measure(TouchTask(row, maze), new_session)

@@ -32,8 +32,6 @@ from evaluation.metrics.statistics import bootstrap
 from evaluation.metrics.trajectory import position_error
 from evaluation.papers.paper_sets import Paper, ResultRow, column, count_sets, run_with_progress
 from evaluation.papers.trial_sessions import (
-    ArenaSession,
-    FilterResult,
     collect_marks,
     draw_map,
     observe_session,
@@ -87,7 +85,6 @@ class _Protocol(NamedTuple):
     worlds: Mapping[str, tuple[float, tuple[str, ...]]]
     note: str
     mappers: tuple[str, ...] = tuple(MAPPERS)
-    methods: tuple[str, ...] = tuple(METHODS)
     stops: tuple[int, ...] = (0,)
     one_arena: bool = True
 
@@ -199,13 +196,13 @@ def _render_results(protocol: _Protocol, rows: Sequence[ResultRow], sets: int) -
         counts = [row.values["reports"] for row in these]
         spread = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
         lines += [f"{world}, {spread} reports", HEAD]
-        for method, along, mapper in product(protocol.methods, _PREFIXES, protocol.mappers):
+        for method, along, mapper in product(METHODS, _PREFIXES, protocol.mappers):
             scored = [row for row in these if row.key[1:] == (method, mapper, along)]
             lines += [_line(_PREFIXES[along].format(method) + mapper, scored)] if scored else []
         lines.append("")
     lines += [_LEGEND, ""]
     if set(PAPERS) <= set(protocol.mappers) and done > 1:
-        for method in protocol.methods:
+        for method in METHODS:
             scores = [
                 pool_grids(
                     [row.session.score for row in rows if row.key[1:] == (method, mapper, FILTERED)], mapper
@@ -239,63 +236,40 @@ def _line(name: str, rows: Sequence[ResultRow]) -> str:
 FEW = 6  # number of sets below which the intervals are too narrow
 
 
-class Measure(NamedTuple):
-    """A way to score a map.
-
-    Attributes:
-        key: of `reproduction.FIELDS`. sign: 1 if larger is worse, else -1. trivial: score of a map without
-            information, or the convention of which it is the best constant map's.
-    """
-
-    name: str
-    key: str
-    sign: int
-    trivial: float | Convention
-
-
-class _Ranking(NamedTuple):
-    """The test of the paper's ranking under one measure.
-
-    Attributes:
-        steps: for each pair of neighbours from worst to best, the mean difference and its 95 % interval.
-            word: `holds`, `does not hold` or `not decided`. beaten: whether a map without information is as
-            good as the best mapper.
-    """
-
-    steps: tuple[tuple[float, float, float], ...]
-    word: str
-    beaten: bool
-
-
-MEASURES = (
-    *(
-        Measure("eq. 6  {:<5}{:<7}{}".format(*each.words), each.column, 1, each)
-        for each in DISTINCT_CONVENTIONS
-    ),
-    Measure("Brier skill", "map_brier_skill", -1, 0.0),
-    Measure("wall AUC", "map_auc", -1, 0.5),
-    Measure("Chamfer, map to walls", "map_chamfer_map", 1, 0.0),
-    Measure("Chamfer, walls to map", "map_chamfer_walls", 1, 0.0),
-)
-"""All measures. A map without information wins either Chamfer distance alone: with few cells, or with all."""
+MEASURES: dict[str, tuple[str, int, float | Convention]] = {
+    **{each.column: ("eq. 6  {:<5}{:<7}{}".format(*each.words), 1, each) for each in DISTINCT_CONVENTIONS},
+    "map_brier_skill": ("Brier skill", -1, 0.0),
+    "map_auc": ("wall AUC", -1, 0.5),
+    "map_chamfer_map": ("Chamfer, map to walls", 1, 0.0),
+    "map_chamfer_walls": ("Chamfer, walls to map", 1, 0.0),
+}
+"""All ways to score a map, by field: name; 1 if larger is worse, else -1; score of a map without information,
+or the convention of which it is the best constant map's. A map without information wins either Chamfer
+distance alone: with few cells, or with all."""
 
 
 def rank_mappers(
-    rows: Sequence[ResultRow], method: str, measure: Measure, along: str = FILTERED
-) -> _Ranking | None:
-    """Tests the paper's ranking for a method's marks along a path; None with fewer than two complete sets."""
-    score = measure.sign * np.array([column(rows, (method, name, along), measure.key) for name in PAPERS])
+    rows: Sequence[ResultRow], method: str, field: str, along: str = FILTERED
+) -> tuple[str, tuple[tuple[float, float, float], ...], bool]:
+    """Tests the paper's ranking for a method's marks along a path, by one of `MEASURES`.
+
+    Returns:
+        `holds`, `does not hold`, `not decided`, or "" with fewer than two complete sets; for each pair of
+        neighbours from worst to best, the mean difference and its 95 % interval; whether a map without
+        information is as good as the best mapper.
+    """
+    _, sign, trivial = MEASURES[field]
+    score = sign * np.array([column(rows, (method, name, along), field) for name in PAPERS])
     score = score[:, np.isfinite(score).all(axis=0)]
     if score.shape[1] < 2:
-        return None
-    name = f"{method} {along} {measure.key}"
+        return "", (), False
+    name = f"{method} {along} {field}"
     steps = tuple((float((a - b).mean()), *bootstrap(a - b, name)) for a, b in pairwise(score))
     holds, fails = all(low > 0 for _, low, _ in steps), any(high <= 0 for *_, high in steps)
     word = "holds" if holds else "does not hold" if fails else "not decided"
-    trivial = measure.trivial
     if isinstance(trivial, Convention):
         trivial = float(np.mean([row.session.score.under(trivial).best for row in rows]))
-    return _Ranking(steps, word, bool(measure.sign * trivial <= score.mean(axis=1).min()))
+    return word, steps, bool(sign * trivial <= score.mean(axis=1).min())
 
 
 def render_rankings(method: str, rows: Sequence[ResultRow]) -> list[str]:
@@ -306,33 +280,29 @@ def render_rankings(method: str, rows: Sequence[ResultRow]) -> list[str]:
         f"{'scored by':<29}{f'{first} - {second}':<29}{f'{second} - {third}':<29}{'verdict':<15}"
         f"{f'on {RECKONED}':<19}on the {TRUE}",
     ]
-    for measure in MEASURES:
-        held = rank_mappers(rows, method, measure)
-        if held is None:
-            lines.append(f"{measure.name:<29}too few sets with a score of all three")
+    for field, (name, *_) in MEASURES.items():
+        word, differences, is_beaten = rank_mappers(rows, method, field)
+        if not word:
+            lines.append(f"{name:<29}too few sets with a score of all three")
             continue
-        steps = "".join(f"{f'{d:+.4f} [{low:+.4f}, {high:+.4f}]':<29}" for d, low, high in held.steps)
-        others = (rank_mappers(rows, method, measure, along) for along in (RECKONED, TRUE))
-        words = [other.word if other else "-" for other in others]
-        beaten = "a map without information is as good" if held.beaten else ""
-        lines.append(f"{measure.name:<29}{steps}{held.word:<15}{words[0]:<19}{words[1]:<18}{beaten}".rstrip())
+        steps = "".join(f"{f'{d:+.4f} [{low:+.4f}, {high:+.4f}]':<29}" for d, low, high in differences)
+        reckoned, true = (rank_mappers(rows, method, field, along)[0] or "-" for along in (RECKONED, TRUE))
+        beaten = "a map without information is as good" if is_beaten else ""
+        lines.append(f"{name:<29}{steps}{word:<15}{reckoned:<19}{true:<18}{beaten}".rstrip())
     if len({row.number for row in rows}) < FEW:
         lines.append(f"Intervals of fewer than {FEW} sets are too narrow.")
     return lines
 
 
-Rows = Sequence[ResultRow]
-
-
-def _draw_reproduction(name: str, protocol: _Protocol, rows: Rows) -> style.Figure:
+def _draw_reproduction(name: str, protocol: _Protocol, rows: Sequence[ResultRow]) -> style.Figure:
     """The figure of a reproduction: method below method, or set below set."""
     shown = [row for row in rows if row.key[3] == FILTERED]
-    first_only, lines = False, len(protocol.methods)
-    method, mapper = protocol.methods.index, protocol.mappers.index
+    first_only, lines = False, len(METHODS)
+    method, mapper = tuple(METHODS).index, protocol.mappers.index
     if name == "fox-fig4":  # a mean map for each mapper
         explanation = "below each mapper: the filter, eq. 6 (mean of the trials' errors)"
         panels = []
-        for key in product(protocol.methods, protocol.mappers):
+        for key in product(METHODS, protocol.mappers):
             these = [row for row in shown if row.key[1:3] == key]
             error = np.mean([row.values[MAIN_CONVENTION.column] for row in these])
             mean = mean_grid([row.session.grid for row in these])
@@ -405,7 +375,7 @@ def plan_jobs(
         session, where = f"create_simulation.seed={own}", f"create_simulation.arena.seed={arena}"
         settings = (session, where, f"session.seed={own}", *assignments)
         variants = {}
-        for method, mapper in product(protocol.methods, protocol.mappers):
+        for method, mapper in product(METHODS, protocol.mappers):
             given = ["backend=grid", f"create_simulation.wheels.level={level}", *overrides, *METHODS[method]]
             if method == "as printed":
                 given.append(f"grid.drift.step={level}")
@@ -427,35 +397,34 @@ def run_job(job: _SessionJob) -> list[ResultRow]:
     session = simulate_session(some.create_simulation)
     count = len(session.truth)
     stops = tuple(min(stop, count) if stop else count for stop in job.stops)
-    found: list[ResultRow] = []
+
+    def score(
+        key: tuple[str, str, str], stop: int, online: np.ndarray, path: np.ndarray, grid: OccupancyGrid
+    ) -> ResultRow:
+        truth, odometry = session.truth[: len(path)], session.odometry[: len(path)]
+        found = score_grid(grid, true_grid(session.arena._replace(start=np.zeros(3)), grid), key[1])
+        values = {
+            "reports": len(path),
+            "odometry_error": position_error(odometry, truth),
+            **path_metrics(online, path, truth),
+            **{error.convention.column: error.error for error in found.errors},
+            **{name: found.quantities[name].value for name in _MAP_METRICS},
+        }
+        result = _MapResult(stop, found, grid, session.arena, truth, odometry, online)
+        return ResultRow((job.world, *key), job.number, job.seed, values, result)
+
+    rows: list[ResultRow] = []
     for variant, config in job.variants.items():
         reports = observe_session(config, session, job.training)
         marks = collect_marks(reports)
         feelers = report_config_of(session.source.info, config.touch.reports).feelers
         for stop, filtered in enumerate(run_filter(config, session, reports, stops)):
-            found.append(_score(job, session, (*variant, FILTERED), stop, filtered))
+            ways = {FILTERED: filtered}
             for name, whole in ((RECKONED, session.odometry), (TRUE, session.truth)):
                 path = whole[: stops[stop]]
-                drawn = FilterResult(path, path, draw_map(config.grid, feelers, session.arena, path, marks))
-                found.append(_score(job, session, (*variant, name), stop, drawn))
-    return found
-
-
-def _score(
-    job: _SessionJob, session: ArenaSession, key: tuple[str, str, str], stop: int, one: FilterResult
-) -> ResultRow:
-    count = len(one.path)
-    truth, odometry = session.truth[:count], session.odometry[:count]
-    score = score_grid(one.grid, true_grid(session.arena._replace(start=np.zeros(3)), one.grid), key[1])
-    values = {
-        "reports": count,
-        "odometry_error": position_error(odometry, truth),
-        **path_metrics(one.online, one.path, truth),
-        **{error.convention.column: error.error for error in score.errors},
-        **{name: score.quantities[name].value for name in _MAP_METRICS},
-    }
-    result = _MapResult(stop, score, one.grid, session.arena, truth, odometry, one.online)
-    return ResultRow((job.world, *key), job.number, job.seed, values, result)
+                ways[name] = path, path, draw_map(config.grid, feelers, session.arena, path, marks)
+            rows += [score((*variant, name), stop, *way) for name, way in ways.items()]
+    return rows
 
 
 _run = partial(run_with_progress, run_job)

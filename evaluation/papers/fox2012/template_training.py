@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from robot.simulation.create.simulated_session import (
     CreateSimulationConfig,
     drive_into_wall,
-    train_strain_templates,
 )
-from tactile.base.files import require_new_file
 from tactile.base.random_streams import stream
 from tactile.base.types import StepEnd
 from tactile.wall_estimation.estimators import WallContact, contact_points, fused_wall
@@ -35,19 +32,6 @@ _LARGE_ERROR_DEG = 10.0
 HeldOutDrive = tuple[float, bool, np.ndarray]
 """One drive into a wall, not used in the training: direction of the wall in base_link, degrees; whether there
 are templates of that angle; errors [S, 3], degrees, by `DURATIONS` and `ESTIMATORS`, NaN without estimate."""
-
-
-def train_to_file(config: CreateSimulationConfig, path: Path) -> StrainTemplates:
-    """Trains the templates of a session's robot and writes them to a file.
-
-    Raises:
-        InputError: the file exists, or the whiskers have no contact.
-    """
-    require_new_file(path, parents=True)
-    templates = train_strain_templates(config)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    templates.write(path)
-    return templates
 
 
 def drive_held_out(config: CreateSimulationConfig, templates: StrainTemplates) -> list[HeldOutDrive]:

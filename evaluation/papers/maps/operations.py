@@ -12,7 +12,7 @@ import numpy as np
 from evaluation.papers.figure import MAPS, Figure, find_figure, write_page
 from evaluation.papers.maps.scenarios import Recipe, Recorded
 from evaluation.papers.maps.stored_maps import STEPS, MapArrays, StoredMap, store_map
-from evaluation.papers.tables.comparison import Files, Record, SessionLog, compare_figures
+from evaluation.papers.tables.comparison import Record, SessionLog, compare_figures
 from evaluation.papers.trial_sessions import capacity_for
 from evaluation.studies.executor import run_tasks
 from ratslam.core.session import Session
@@ -173,7 +173,7 @@ def reproduce_maps(
         else:
             labels[name] = dict(enumerate(usual[:sessions]))
     planned = [(name, label) for name in names for label in labels[name].values()]
-    log = SessionLog("maps", Files(output, against), planned)
+    log = SessionLog("maps", (output, against), planned)
 
     def measure(name: str, figure: Figure) -> tuple[list[str], list[Measured]]:
         used = list(labels[name].values())

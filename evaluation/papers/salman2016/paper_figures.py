@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,42 +15,6 @@ _SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
 _GAP, _BOTTOM = 0.75, 0.9  # inches between panels, and below them
 _DOTS = (0, (2, 2))
 _MEDIAN = 0.3  # half width of a median bar, share of a condition's width
-
-
-class ExperienceHistory(NamedTuple):
-    """The current experience at each of T steps and the verdict of the Experience Metric.
-
-    Attributes:
-        place: [T] experience, -1 for none. counted: [T] a re-localisation. right: [T] a correct one.
-        invalid: [T] an experience created between an incorrect and the next correct re-localisation.
-        base: number of steps in the base set.
-    """
-
-    place: np.ndarray
-    counted: np.ndarray
-    right: np.ndarray
-    invalid: np.ndarray
-    base: int
-
-
-def experience_history(place: np.ndarray, metric: ExperienceMetric | None) -> ExperienceHistory:
-    """The history of T steps with the current experience `place` [T], -1 for none.
-
-    Args:
-        metric: the verdict on them; None: no step is a re-localisation.
-    """
-    none = np.zeros(len(place), bool)
-    if metric is None:
-        return ExperienceHistory(place, none, none, none, 0)
-    known = place >= 0
-    counted, right, invalid = none.copy(), none.copy(), none.copy()
-    counted[known], right[known] = metric.counted, metric.right
-    # An experience is invalid if the last re-localisation before it was wrong.
-    last = np.maximum.accumulate(np.where(counted, np.arange(len(counted)), -1))
-    wrong = (last >= 0) & ~right[last]
-    invalid[known] = wrong[creation_rows(place[known])]
-    base = int(np.flatnonzero(known)[metric.base - 1]) + 1
-    return ExperienceHistory(place, counted, right, invalid, base)
 
 
 def draw_drift(
@@ -79,22 +42,38 @@ def draw_drift(
     return figure
 
 
-def draw_experiences(title: str, line: str, runs: Mapping[str, ExperienceHistory]) -> style.Figure:
-    """Draws the experience at each step, the end of the base set and the verdicts (Fig. 3)."""
+def draw_experiences(
+    title: str, line: str, runs: Mapping[str, tuple[np.ndarray, ExperienceMetric | None]]
+) -> style.Figure:
+    """Draws the experience at each step, the end of the base set and the verdicts (Fig. 3).
+
+    Args:
+        runs: by name, the current experience at each of T steps, [T], -1 for none, and the verdict of the
+            Experience Metric; None: no step is a re-localisation.
+    """
     figure, panels = _panels(title, line, runs, 3.4)
-    for axes, run in zip(panels, runs.values(), strict=True):
-        new = (run.place >= 0) & ~run.counted
+    for axes, (place, metric) in zip(panels, runs.values(), strict=True):
+        known = place >= 0
+        # [T] whether a step is a re-localisation, a correct one, and of an experience that is invalid: the
+        # last re-localisation before it was created was wrong. Steps of the base set.
+        counted, right, invalid, base = *np.zeros((3, len(place)), bool), 0
+        if metric is not None:
+            counted[known], right[known] = metric.counted, metric.right
+            last = np.maximum.accumulate(np.where(counted, np.arange(len(counted)), -1))
+            wrong = (last >= 0) & ~right[last]
+            invalid[known] = wrong[creation_rows(place[known])]
+            base = int(np.flatnonzero(known)[metric.base - 1]) + 1
+        new = known & ~counted
         for rows, color, mark, label in (
-            (new & ~run.invalid, GREY, "o", "valid experience"),
-            (new & run.invalid, YELLOW, "o", "invalid experience"),
-            (run.counted & run.right, BLUE, "o", "correct re-localisation"),
-            (run.counted & ~run.right, VERMILLION, "x", "incorrect re-localisation"),
+            (new & ~invalid, GREY, "o", "valid experience"),
+            (new & invalid, YELLOW, "o", "invalid experience"),
+            (counted & right, BLUE, "o", "correct re-localisation"),
+            (counted & ~right, VERMILLION, "x", "incorrect re-localisation"),
         ):
             steps = np.flatnonzero(rows)
-            axes.plot(steps, run.place[steps], mark, ms=2.6 if mark == "o" else 3.6,
+            axes.plot(steps, place[steps], mark, ms=2.6 if mark == "o" else 3.6,
                       mew=0.9 if mark == "x" else 0, color=color, label=label)  # fmt: skip
-        axes.axvline(run.base - 0.5, color=INK, lw=1.1, ls=_DOTS, label="end of the base set")
-        axes.grid(color=LINE_GREY, lw=0.7)
+        axes.axvline(base - 0.5, color=INK, lw=1.1, ls=_DOTS, label="end of the base set")
         style.name_axes(axes, "step", "experience")
     style.add_legend(figure, panels[0], columns=3)
     return figure
@@ -136,7 +115,7 @@ def draw_measured(
             axes.tick_params(which="minor", length=0)
         else:
             axes.set_ylim(bottom=0)
-        axes.grid(color=LINE_GREY, lw=0.7, axis="y")
+        axes.grid(False, axis="x")
     fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
     style.add_legend(figure, fullest)
     return figure
@@ -173,7 +152,6 @@ def draw_curves(
             for number, (x, y) in enumerate(zip(arcr, arr, strict=True)):
                 axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
         axes.set(xlim=(-0.04, 1.04), ylim=(0, None))
-        axes.grid(color=LINE_GREY, lw=0.7)
         style.name_axes(axes, "ARCR, strict", "ARR")
     style.add_legend(figure, panels[0])
     return figure
@@ -200,11 +178,9 @@ def draw_tuning(
     figure, (left, right) = _panels("Tuning of the classic matcher", line, ("", ""), 3.4)
     for count, color, label in ((same, BLUE, "same place"), (other, VERMILLION, "different places")):
         left.stairs(count / max(count.sum(), 1), edge, color=color, fill=True, alpha=0.45, label=label)
-    left.grid(color=LINE_GREY, lw=0.7)
     style.name_axes(left, "difference of two views", "share of pairs")
     right.plot(threshold, correct, "o-", ms=3, lw=1.0, color=GREEN, label="correct")
     right.plot(threshold, incorrect, "x-", ms=4, lw=1.0, color=PURPLE, label="incorrect")
-    right.grid(color=LINE_GREY, lw=0.7)
     style.name_axes(right, "threshold", "re-localisations")
     for axes in (left, right):
         if winner is not None:
@@ -217,7 +193,7 @@ def draw_tuning(
 def _panels(
     title: str, line: str, names: Collection[str], height: float, *, across: int = 0, below: float = _BOTTOM
 ) -> tuple[style.Figure, list[style.Axes]]:
-    """A figure with a panel of a height in inches for each name, `across` per row (0: all)."""
+    """A figure with a panel of a height in inches for each name, `across` per row (0: all), with a grid."""
     across = across or len(names)
     rows = -(-len(names) // across)
     whole = style.TOP + rows * height + (rows - 1) * _GAP + below
@@ -230,11 +206,11 @@ def _panels(
         bottom = whole - style.TOP - (row + 1) * height - row * _GAP
         panels.append(style.add_axes(figure, left, bottom, width, height - 0.2))
         panels[-1].set_title(name, fontsize=9.5, color=INK, loc="left")
+        panels[-1].grid(color=LINE_GREY, lw=0.7)
     return figure, panels
 
 
 def _map_axes(axes: style.Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.locator_params(steps=[1, 2, 5, 10])  # short tick labels
-    axes.grid(color=LINE_GREY, lw=0.7)
     style.name_axes(axes, "x (m)", "y (m)")

@@ -25,7 +25,6 @@ from evaluation.papers.paper_sets import (
     sweep_thresholds,
 )
 from evaluation.papers.salman2016 import paper_figures
-from evaluation.papers.salman2016.paper_figures import experience_history
 from evaluation.papers.salman2016.protocols import (
     BY_MAZE,
     COMMON,
@@ -93,23 +92,13 @@ LABELS = {
 }
 
 
-class _Verdict(NamedTuple):
-    """The test of a claim with the sessions of one method.
+def judge_claim(claim: Claim, here: np.ndarray, there: np.ndarray) -> tuple[str, str]:
+    """Tests a claim with the values [S] of its two conditions over the same sets.
 
-    Attributes:
-        estimate: mean difference, geometric mean ratio or mean, named in `text`. low, high: 95 % interval.
-        word: `confirmed`, `refuted`, `not decided` or `undefined`.
+    Returns:
+        `confirmed`, `refuted`, `not decided` or `undefined`; the mean difference, geometric mean ratio or
+        mean, with its 95 % interval.
     """
-
-    estimate: float
-    low: float
-    high: float
-    word: str
-    text: str
-
-
-def judge_claim(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0) -> _Verdict:
-    """Tests a claim with the values [S] of its two conditions over the same sets."""
     if claim.kind == "small":
         values, name, back = here, "mean", lambda x: x
     elif claim.quantity in _RATIOS:
@@ -119,8 +108,8 @@ def judge_claim(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0
         values, name, back = there - here, "difference", lambda x: x
     values = values[np.isfinite(values)]
     if len(values) < 2:
-        return _Verdict(np.nan, np.nan, np.nan, "undefined", "fewer than two sets have both figures")
-    low, high = bootstrap(values, f"reproduce.{claim.text}", seed=seed)
+        return "undefined", "fewer than two sets have both figures"
+    low, high = bootstrap(values, f"reproduce.{claim.text}")
     if claim.kind == "small":
         yes, no = high < SMALL, low >= SMALL
     elif claim.kind == "alike":
@@ -129,8 +118,7 @@ def judge_claim(claim: Claim, here: np.ndarray, there: np.ndarray, seed: int = 0
         yes, no = low > 0, high <= 0
     word = "confirmed" if yes else "refuted" if no else "not decided"
     estimate, low, high = (float(back(x)) for x in (float(values.mean()), low, high))
-    text = f"{name} {estimate:.3g} [{low:.3g}, {high:.3g}], {len(values)} sets"
-    return _Verdict(estimate, low, high, word, text)
+    return word, f"{name} {estimate:.3g} [{low:.3g}, {high:.3g}], {len(values)} sets"
 
 
 def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> str:
@@ -158,8 +146,8 @@ def render_claims(protocol: Protocol, rows: Sequence[ResultRow], sets: int) -> s
         for method in methods:
             keys = ((name, method, "none") for name in (claim.here, claim.there))
             here, there = (column(rows, key, claim.quantity) for key in keys)
-            verdict = judge_claim(claim, here, there)
-            lines.append(f"  {method:<20} {verdict.word.upper()}: {verdict.text}")
+            word, text = judge_claim(claim, here, there)
+            lines.append(f"  {method:<20} {word.upper()}: {text}")
     if protocol.claims and 1 < done < _DECISIVE:
         lines.append(
             f"By chance all {done} sets agree in {2.0 ** (1 - done):.0%} of cases; "
@@ -228,9 +216,7 @@ def _draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figur
         return paper_figures.draw_drift(title, line, paths)
     if name == "fig3":
         runs = ((row.key[1], row.session[1]) for row in first)
-        histories = {
-            method: experience_history(run.place, experience_metric_if_defined(run)) for method, run in runs
-        }
+        histories = {method: (run.place, experience_metric_if_defined(run)) for method, run in runs}
         return paper_figures.draw_experiences(title, line, histories)
     if name == "fig5":
         maps = {}

@@ -8,7 +8,7 @@ place, and of two places.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -47,21 +47,17 @@ class ThresholdScore(NamedTuple):
     incorrect: int
 
 
-class _Tuning(NamedTuple):
-    """The chosen score or None, the reason, the views, all scores, and the scored steps (from, to)."""
-
-    winner: ThresholdScore | None
-    reason: str
-    views: ViewDifferences
-    scores: list[ThresholdScore]
-    steps: tuple[int, int]
-
-
-def tune_threshold(document: Document, folder: Path, workers: int = 1) -> _Tuning:
+def tune_threshold(
+    document: Document, folder: Path, workers: int = 1, output: Path | None = None
+) -> Iterator[str]:
     """Tunes the threshold of a configuration.
 
     Args:
-        folder: of the configuration file. workers: processes that share the grid.
+        folder: of the configuration file. workers: processes that share the grid. output: folder, created if
+            missing, for threshold.png and threshold.csv.
+
+    Yields:
+        the differences of views, the score of each threshold, and the choice; then what was written.
 
     Raises:
         InputError: the source cannot be used, has no truth or no views, or never returns to its start.
@@ -78,7 +74,18 @@ def tune_threshold(document: Document, folder: Path, workers: int = 1) -> _Tunin
     scored = run_tasks(_score_thresholds, [(config, log, base, part) for part in parts], workers=workers)
     scores = [score for part in scored for score in part]
     winner, reason = choose_threshold(scores, views)
-    return _Tuning(winner, reason, views, scores, (base, log.length))
+    yield from _render(views, scores, winner, f"steps {base} to {log.length}")
+    verdict = f"templates.threshold={winner.threshold:g}" if winner else "no threshold satisfies"
+    yield f"\n{verdict}: {reason}"
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+        plot, table = output / "threshold.png", output / "threshold.csv"
+        threshold, _, correct, incorrect = (np.array(column) for column in zip(*scores, strict=True))
+        chosen = None if winner is None else winner.threshold
+        draw_tuning(*views, threshold, correct, incorrect, chosen).savefig(plot)
+        lines = [",".join(ThresholdScore._fields), *(",".join(map(repr, each)) for each in scores)]
+        table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        yield f"\nwrote {plot} and {table}"
 
 
 def choose_threshold(
@@ -121,40 +128,21 @@ def view_differences(config: TemplateConfig, views: np.ndarray, others: np.ndarr
     return np.min([np.abs(views[:, None] - other[None]).mean(axis=axes) for other in shifted], axis=0)
 
 
-def render_tuning(tuning: _Tuning) -> str:
-    """The differences of views, the score of each threshold, and the choice."""
-    views, (start, stop) = tuning.views, tuning.steps
-    lines = [
-        "before any map: mean absolute difference of two views",
-        f"  {'':<18}{'5 %':>8}{'median':>8}{'95 %':>8}{'pairs':>10}",
-    ]
+def _render(
+    views: ViewDifferences, scores: Sequence[ThresholdScore], winner: ThresholdScore | None, steps: str
+) -> Iterator[str]:
+    """The lines about the differences of views, and the score of each threshold."""
+    yield "before any map: mean absolute difference of two views"
+    yield f"  {'':<18}{'5 %':>8}{'median':>8}{'95 %':>8}{'pairs':>10}"
     for name, counts in (("the same place", views.same), ("different places", views.other)):
         cells = "".join(f"{views.quantile(counts, share):>8.3f}" for share in (0.05, 0.5, 0.95))
-        lines.append(f"  {name:<18}{cells}{counts.sum():>10}")
-    lines += [
-        f"  AUC {views.auc:.3f} (1: the views separate places; 0.5: they do not)",
-        "",
-        f"steps {start} to {stop}, after the base set up to the end of lap {LAPS} (or of the session)",
-        f"  {'threshold':>9}{'ARR':>8}{'correct':>9}{'incorrect':>11}",
-    ]
-    for one in tuning.scores:
-        mark = "  <- the winner" if one is tuning.winner else ""
-        lines.append(f"  {one.threshold:>9.3f}{one.arr:>8.3f}{one.correct:>9}{one.incorrect:>11}{mark}")
-    winner = tuning.winner
-    verdict = f"templates.threshold={winner.threshold:g}" if winner else "no threshold satisfies"
-    return "\n".join([*lines, "", f"{verdict}: {tuning.reason}"])
-
-
-def save_tuning(tuning: _Tuning, directory: Path) -> tuple[Path, Path]:
-    """Writes threshold.png and threshold.csv to a folder, created if missing."""
-    directory.mkdir(parents=True, exist_ok=True)
-    plot, table = directory / "threshold.png", directory / "threshold.csv"
-    threshold, _, correct, incorrect = (np.array(column) for column in zip(*tuning.scores, strict=True))
-    winner = None if tuning.winner is None else tuning.winner.threshold
-    draw_tuning(*tuning.views, threshold, correct, incorrect, winner).savefig(plot)
-    lines = [",".join(ThresholdScore._fields), *(",".join(map(repr, each)) for each in tuning.scores)]
-    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return plot, table
+        yield f"  {name:<18}{cells}{counts.sum():>10}"
+    yield f"  AUC {views.auc:.3f} (1: the views separate places; 0.5: they do not)"
+    yield f"\n{steps}, after the base set up to the end of lap {LAPS} (or of the session)"
+    yield f"  {'threshold':>9}{'ARR':>8}{'correct':>9}{'incorrect':>11}"
+    for one in scores:
+        mark = "  <- the winner" if one is winner else ""
+        yield f"  {one.threshold:>9.3f}{one.arr:>8.3f}{one.correct:>9}{one.incorrect:>11}{mark}"
 
 
 def _score_thresholds(task: tuple[RunConfig, InMemorySource, int, np.ndarray]) -> list[ThresholdScore]:

@@ -62,13 +62,9 @@ class BuildingsRow(NamedTuple):
     cell: float = 1.0
     sector: float = 1.0
 
-    def configuration(self, folder: Path) -> RunConfig:
-        """The configuration of its runs.
-
-        Args:
-            folder: of the repository.
-        """
-        config = self.recording.configuration(folder)
+    def configuration(self) -> RunConfig:
+        """The configuration of its runs."""
+        config = self.recording.configuration()
         if self.cell == self.sector == 1:
             return config
         fov = float(config.recall.sector_fov)
@@ -77,7 +73,7 @@ class BuildingsRow(NamedTuple):
             "experience.match_sd": config.experience.match_sd * self.cell,
             "recall.sector_fov": fov * self.sector,
         }
-        return self.recording.configuration(folder, *(f"{key}={value!r}" for key, value in scaled.items()))
+        return self.recording.configuration(*(f"{key}={value!r}" for key, value in scaled.items()))
 
 
 class RunFigures(NamedTuple):
@@ -138,25 +134,23 @@ def buildings_table(
     rows: Mapping[str, BuildingsRow],
     copies: int = 10,
     workers: int = 0,
-    folder: Path = Path(),
-    files: Files = Files(),  # noqa: B008
+    files: Files = (None, None),
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its runs are done; totals and missing recordings below it.
 
     Args:
-        rows: those of `buildings_rows` to print. folder: of the repository, which holds `configs`. files: of
-            the runs, `buildings.csv`, and of those to compare them with below the table; a session is the
-            seed of a copy, 0 the recording as it is.
+        rows: those of `buildings_rows` to print. files: of the runs, `buildings.csv`, and of those to compare
+            them with below the table; a session is the seed of a copy, 0 the recording as it is.
 
     Raises:
         InputError: one of these files cannot be used.
     """
-    missing = {name: reason for name, row in rows.items() if (reason := row.recording.missing(folder))}
+    missing = {name: reason for name, row in rows.items() if (reason := row.recording.missing())}
     present = {name: row for name, row in rows.items() if name not in missing}
     counts = {name: 1 + copies * bool(row.copies) for name, row in present.items()}
     planned = [(name, seed) for name, count in counts.items() for seed in range(count)]
     log = SessionLog("buildings", files, [(name, str(seed)) for name, seed in planned])
-    tasks = [(present[name].configuration(folder), present[name].copies, seed) for name, seed in planned]
+    tasks = [(present[name].configuration(), present[name].copies, seed) for name, seed in planned]
     results = zip(planned, run_tasks(_measure_run, tasks, workers=workers), strict=True)
     found: dict[Section, list[RunFigures]] = {}
     notes = []
@@ -320,20 +314,14 @@ ROWS = {
 }
 
 
-def laser_table(
-    rows: Sequence[str] = tuple(ROWS), copies: int = 10, workers: int = 0, folder: Path = Path()
-) -> Iterator[str]:
-    """The lines of the table; rows whose recordings are missing are named below it.
-
-    Args:
-        folder: of the repository, which holds `configs` and `tests`.
-    """
-    missing = {row: reason for row in rows if (reason := ROWS[row].missing(folder))}
+def laser_table(rows: Sequence[str] = tuple(ROWS), copies: int = 10, workers: int = 0) -> Iterator[str]:
+    """The lines of the table; rows whose recordings are missing are named below it."""
+    missing = {row: reason for row in rows if (reason := ROWS[row].missing())}
     present = [row for row in rows if row not in missing]
     tasks = []
     for row in present:
-        tasks.append((ROWS[row].configuration(folder, "backend=classic"), 0))
-        tasks += [(ROWS[row].configuration(folder), seed) for seed in range(copies + 1)]
+        tasks.append((ROWS[row].configuration("backend=classic"), 0))
+        tasks += [(ROWS[row].configuration(), seed) for seed in range(copies + 1)]
     results = run_tasks(_measure_recording, tasks, workers=workers)
     heads = ("classic (closures, false)", "ratslam (closures, false)", "perturbed: median, maximum")
     yield markdown_header(["recording", "odometry", *heads])

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 from scipy.optimize import minimize
@@ -24,7 +24,6 @@ from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.touch_table import CHANGE, TouchTask, task_config
 from evaluation.papers.trial_sessions import run_session, start_session
 from evaluation.studies.executor import run_tasks
-from ratslam.core.session import Session
 from ratslam.mapping.closure_judge import (
     BEYOND,
     KINDS,
@@ -36,8 +35,7 @@ from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap
 from ratslam.runs.build_session import open_observations
-from ratslam.runs.settings.run_config import RunConfig
-from robot.sources.in_memory import InMemorySource, load_into_memory
+from robot.sources.in_memory import load_into_memory
 from tactile.base.se2 import between, wrap
 
 ROWS = (
@@ -58,18 +56,9 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class JudgedSession(NamedTuple):
-    """The n sequences of a session.
-
-    Attributes:
-        true: [n] bool. score: [n] evidence of recall. accepted: [n] bool. known: evidence when all, `YOUNG`
-            and no keyframes have followed them.
-    """
-
-    true: np.ndarray
-    score: np.ndarray
-    accepted: np.ndarray
-    known: tuple[SequenceEvidence, SequenceEvidence, SequenceEvidence]
+JudgedSession = tuple[np.ndarray, np.ndarray, np.ndarray, tuple[SequenceEvidence, ...]]
+"""The n sequences of a session: [n] bool, true; [n] evidence of recall; [n] bool, accepted; evidence when
+all, `YOUNG` and no keyframes have followed them."""
 
 
 def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = None) -> Iterator[str]:
@@ -99,35 +88,25 @@ def _judge_session(task: TouchTask) -> JudgedSession:
     """Runs a session and judges the sequences of its final map."""
     with open_observations(task_config(task)) as (config, source):
         log = load_into_memory(source)
-    held: list[Session] = []
-
-    def start(config: RunConfig, log: InMemorySource) -> Session:
-        held.append(start_session(config, log))
-        return held[0]
-
-    truth = run_session(config, log, start).truth
-    map = held[0].map
+    session = start_session(config, log)
+    truth, map = run_session(config, log, lambda *_: session).truth, session.map
     assert isinstance(map, KeyframeMap)
     final, graph, steps = map.solution(), map.keyframes(), map.keyframe_steps()
     scores = final.log.scores()
     # Sequences count from this evidence of recall and this number of candidates on.
     chosen = np.flatnonzero((scores >= 5.0) & (final.log.left() >= 2))
     later = steps >= (int(CHANGE * len(truth)) if task.row == "control: other maze" else 0)
-    first, second, third = (
+    known = (
         sequence_evidence(graph, final.fit, final.log, final.cut, chosen, after)
         for after in (BEYOND, YOUNG, 0)
     )
-    return JudgedSession(
-        _are_true(graph, final.log, truth[steps], later, chosen),
-        scores[chosen],
-        final.log.verdicts()[chosen] == Verdict.ACCEPTED,
-        (first, second, third),
-    )
+    true = _are_true(graph, final.log, truth[steps], later, chosen)
+    return true, scores[chosen], final.log.verdicts()[chosen] == Verdict.ACCEPTED, tuple(known)
 
 
 def fit_weights(sessions: Sequence[JudgedSession]) -> np.ndarray:
     """The weights [2, 3 + 2 KINDS] of a logistic regression over the map, and of one over the older pass."""
-    versions = [(evidence, one.true) for one in sessions for evidence in one.known]
+    versions = [(evidence, true) for true, _, _, known in sessions for evidence in known]
     features = np.concatenate([evidence.features() for evidence, _ in versions])
     true = np.concatenate([true for _, true in versions]).astype(float)
     known = np.isfinite(features).all(axis=(1, 2))
@@ -172,7 +151,7 @@ def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[np.ndar
     """A row of the table; each session with its own weights."""
     true, score, accepted = (np.concatenate([one[k] for one in sessions]) for k in range(3))
     odds, ended = (
-        np.concatenate([one.known[k].log_odds(own) for one, own in zip(sessions, fitted, strict=True)])
+        np.concatenate([one[3][k].log_odds(own) for one, own in zip(sessions, fitted, strict=True)])
         for k in (0, 2)
     )
     known = np.isfinite(odds)

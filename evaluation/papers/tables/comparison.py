@@ -9,12 +9,14 @@ session, the code that measured it, and its figures, each a number or yes or no.
   what compares that figure; a cell that leaves pairs out says of how many it is.
 - The ratio of a pair is that now over that before: 1 where both are equal, also if both are 0 or infinite,
   and infinite where only that before is 0.
-- The interval of a median of ratios is that of order statistics (Thompson 1936); cured and new failures are
-  compared by the sign test (McNemar 1947, exact), as all other pairs say nothing of the difference.
+- The interval of a median of ratios is that of order statistics, which covers the median of the population
+  with at least 95 % whatever the distribution (Thompson 1936); there is none with fewer than six pairs.
+- Cured and new failures are compared by the two-sided sign test (McNemar 1947, exact), as all other pairs say
+  nothing of the difference.
 
 Example:
     >>> key = ("clean", "31100")
-    >>> old, new = ({key: StoredSession(key, "", {"em": em})} for em in (0.02, 0.01))
+    >>> old, new = ({key: ("", {"em": em})} for em in (0.02, 0.01))
     >>> pairs = _pair_sessions(old, new, ["clean"])
     >>> paired_ratios(*pairs.known("em")).tolist()
     [0.5]
@@ -25,7 +27,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,9 +42,6 @@ from tactile.base.files import write_text_atomically
 
 KEY = ("row", "session", "code")
 """The first columns of a file."""
-LEVEL = 0.95
-"""Least coverage of an interval."""
-
 Figure = bool | int | float
 Record = Mapping[str, Figure]
 """The figures of a session by name."""
@@ -50,28 +49,11 @@ Key = tuple[str, str]
 """Row and session."""
 
 
-class Files(NamedTuple):
-    """Folders of a run.
-
-    Attributes:
-        output: where its sessions are written; None: nowhere. against: of the earlier run that it is compared
-            with; None: with none.
-    """
-
-    output: Path | None = None
-    against: Path | None = None
-
-
-class StoredSession(NamedTuple):
-    """A row of a file. `code` is what measured it: the digest of the code, and the settings beside row and
-    session on which the figures depend."""
-
-    key: Key
-    code: str
-    figures: Record
-
-
-Sessions = dict[Key, StoredSession]
+Files = tuple[Path | None, Path | None]
+"""Folders of a run: where its sessions are written, and of the earlier run that it is compared with."""
+Sessions = dict[Key, tuple[str, Record]]
+"""The rows of a file: what measured a session, which is the digest of the code and the settings beside row
+and session on which the figures depend; and its figures."""
 
 
 class SessionLog:
@@ -82,7 +64,7 @@ class SessionLog:
 
     Args:
         name: of the table; its file is `NAME.csv`. planned: the sessions that will be measured. settings: see
-            `StoredSession`.
+            `Sessions`.
 
     Attributes:
         measured: the sessions added so far. earlier: those of the run to compare with; None without one.
@@ -109,20 +91,19 @@ class SessionLog:
         plain = {
             name: value.item() if isinstance(value, np.generic) else value for name, value in figures.items()
         }
-        key = row, str(session)
-        self.measured[key] = StoredSession(key, self._code, plain)
+        self.measured[row, str(session)] = self._code, plain
         if self._path is not None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            write_text_atomically(self._path, sessions_text({**self._kept, **self.measured}.values()))
+            write_text_atomically(self._path, sessions_text({**self._kept, **self.measured}))
 
 
-def sessions_text(sessions: Collection[StoredSession]) -> str:
+def sessions_text(sessions: Sessions) -> str:
     """The text of a file; a cell is empty where a session has no such figure, or NaN."""
-    names = dict.fromkeys(chain.from_iterable(one.figures for one in sessions))
+    names = dict.fromkeys(chain.from_iterable(figures for _, figures in sessions.values()))
     text = io.StringIO()
     writer = csv.DictWriter(text, [*KEY, *names], lineterminator="\n")
     writer.writeheader()
-    for (row, session), code, figures in sessions:
+    for (row, session), (code, figures) in sessions.items():
         known = {name: repr(value) for name, value in figures.items() if value == value}
         writer.writerow({"row": row, "session": session, "code": code} | known)
     return text.getvalue()
@@ -136,7 +117,7 @@ def read_sessions(path: Path) -> Sessions:
     """
     seen: set[Key] = set()
 
-    def parse(cells: Mapping[str, str]) -> StoredSession:
+    def parse(cells: Mapping[str, str]) -> tuple[Key, tuple[str, Record]]:
         key = cells["row"], cells["session"]
         if None in cells or None in cells.values():
             raise ValueError("cells that are missing, or too many")
@@ -151,9 +132,9 @@ def read_sessions(path: Path) -> Sessions:
                 figures[name] = cell == "True"
             else:
                 figures[name] = int(cell) if cell.lstrip("-").isdecimal() else float(cell)
-        return StoredSession(key, cells["code"], figures)
+        return key, (cells["code"], figures)
 
-    return {one.key: one for one in read_rows(path, "a file of sessions, as -o writes it", parse)}
+    return dict(read_rows(path, "a file of sessions, as -o writes it", parse))
 
 
 def _earlier_sessions(folder: Path, name: str, planned: Iterable[Key]) -> Sessions:
@@ -209,42 +190,14 @@ def _pair_sessions(old: Sessions, new: Sessions, rows: Sequence[str]) -> _Pairs:
     """The sessions of these rows that are in both runs, in the order of that now."""
     old, new = ({key: one for key, one in run.items() if key[0] in rows} for run in (old, new))
     keys = [key for key in new if key in old]
-    return _Pairs(
-        keys, [old[key].figures for key in keys], [new[key].figures for key in keys],
-        len(old) - len(keys), len(new) - len(keys),
-    )  # fmt: skip
+    before, after = ([run[key][1] for key in keys] for run in (old, new))
+    return _Pairs(keys, before, after, len(old) - len(keys), len(new) - len(keys))
 
 
 def paired_ratios(old: np.ndarray, new: np.ndarray) -> np.ndarray:
     """[n] ratio of each pair of figures [n] that are not negative: 1 of equal ones, infinite over 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(old == new, 1.0, new / old)
-
-
-def median_interval(values: np.ndarray) -> tuple[float, float]:
-    """The interval of the median of a population from values [n], which covers it with at least `LEVEL`
-    whatever the distribution; NaN with too few of them, for 95 % with fewer than six.
-
-    The k smallest and the k largest values are left out. The median is beyond the k-th smallest one with the
-    probability that k - 1 or fewer of n tosses of a coin are heads, and k is the largest for which that is at
-    most half of what the interval may miss (Thompson 1936, Annals of Mathematical Statistics 7, 122-128).
-    """
-    from scipy.stats import binom
-
-    k = int((binom.cdf(np.arange(len(values)), len(values), 0.5) <= (1 - LEVEL) / 2).sum())
-    if not k:
-        return np.nan, np.nan
-    ordered = np.sort(values)
-    return float(ordered[k - 1]), float(ordered[-k])
-
-
-def sign_test(cured: int, new: int) -> float:
-    """Two-sided p value of the hypothesis that failures are cured as often as there are new ones: that so
-    many of cured + new tosses of a coin are heads, or a number as improbable (McNemar 1947, Psychometrika 12,
-    153-157, in its exact form); 1 without any."""
-    from scipy.stats import binomtest
-
-    return float(binomtest(new, cured + new).pvalue) if cured + new else 1.0
 
 
 class Compared(NamedTuple):
@@ -271,18 +224,12 @@ def compare_runs(what: Compared, log: SessionLog, rows: Sequence[str]) -> Iterat
 
     Each row of the table has a line, and all together have one. Figures are before and now.
     """
-    if log.earlier is None:
-        return
-    yield from ["", "Before, and now, of the same sessions:", ""]
-    for number, (name, pairs) in enumerate(_groups(log, rows)):
-        cells = _compared_cells(what, pairs)
-        if not number:
-            yield markdown_header(["row", *cells])
-        yield markdown_row([name, *cells.values()])
-    keys, before, now = _failures(what, _pair_sessions(log.earlier, log.measured, rows))
-    failures = [" ".join(key) for key, new in zip(keys, now & ~before, strict=True) if new]
-    yield from ["", f"New failures: {', '.join(failures) or 'none'}."]
-    yield from _provenance(log, rows)
+    if log.earlier is not None:
+        cells = {name: _compared_cells(what, pairs) for name, pairs in _groups(log, rows)}
+        keys, before, now = _failures(what, _pair_sessions(log.earlier, log.measured, rows))
+        new = ", ".join(" ".join(key) for key, is_new in zip(keys, now & ~before, strict=True) if is_new)
+        lines = [[name, *each.values()] for name, each in cells.items()]
+        yield from _lines(log, rows, ["row", *next(iter(cells.values()))], lines, new)
 
 
 def compare_figures(log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
@@ -290,30 +237,46 @@ def compare_figures(log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
     those that several rows have. Yes or no is whether a session fails in something."""
     if log.earlier is None:
         return
-    yield from ["", "Before, and now, of the same sessions:", ""]
-    yield markdown_header(
-        ["row", "figure", "sessions", "before", "now", "now / before [95 %]", "cured, new (p)"]
-    )
-    failures = []
+    lines, failures = [], []
     for row, pairs in _groups(log, rows):
-        names = list(dict.fromkeys(chain.from_iterable(pairs.new)))
-        for name in names:
+        for name in dict.fromkeys(chain.from_iterable(pairs.new)):
             having = {key[0] for key, one in zip(pairs.keys, pairs.new, strict=True) if name in one}
             if row == ALL and len(having) < 2:
                 continue
             keys, old, new = pairs.named(name)
             all_of = sum(key[0] in having for key in pairs.keys)
             number = f"{len(keys)} of {all_of}" if len(keys) < all_of else str(all_of)
-            cells: tuple[str, ...]
             if any(isinstance(one.get(name), bool) for one in pairs.new):
-                cells = f"{old.sum():.0f}", f"{new.sum():.0f}", "-", _changed(old > 0, new > 0)
+                cells = [f"{old.sum():.0f}", f"{new.sum():.0f}", "-", _changed(old > 0, new > 0)]
                 changed = [" ".join(key) for key, is_new in zip(keys, new > old, strict=True) if is_new]
                 failures += [f"{name}: {', '.join(changed)}"] if changed and row != ALL else []
             else:
-                cells = _median(old), _median(new), _spread(paired_ratios(old, new)), "-"
-            yield markdown_row([row, name, number, *cells])
-    yield from ["", f"New failures: {'; '.join(failures) or 'none'}."]
-    yield from _provenance(log, rows)
+                cells = [_median(old), _median(new), _spread(paired_ratios(old, new)), "-"]
+            lines.append([row, name, number, *cells])
+    columns = ["row", "figure", "sessions", "before", "now", "now / before [95 %]", "cured, new (p)"]
+    yield from _lines(log, rows, columns, lines, "; ".join(failures))
+
+
+def _lines(
+    log: SessionLog, rows: Sequence[str], columns: list[str], lines: list[list[str]], failures: str
+) -> Iterator[str]:
+    """A comparison as Markdown; below it new failures, the sessions that are in one run alone, and what
+    measured the others."""
+    assert log.earlier is not None
+    yield from ["", "Before, and now, of the same sessions:", "", markdown_header(columns)]
+    yield from map(markdown_row, lines)
+    yield from ["", f"New failures: {failures or 'none'}."]
+    lone = [
+        f"{row} {pairs.only_old} before, {pairs.only_new} now"
+        for row, pairs in _groups(log, rows)
+        if row != ALL and pairs.only_old + pairs.only_new
+    ]
+    if lone:
+        yield f"In one run alone and left out, sessions: {'; '.join(lone)}."
+    keys = _pair_sessions(log.earlier, log.measured, rows).keys
+    codes = [Counter(run[key][0] for key in keys) for run in (log.earlier, log.measured)]
+    named = [", ".join(f"{code} ({count} sessions)" for code, count in each.items()) for each in codes]
+    yield f"Code before: {named[0] or 'none'}; now: {named[1] or 'none'}."
 
 
 ALL = "all rows"
@@ -327,22 +290,6 @@ def _groups(log: SessionLog, rows: Sequence[str]) -> Iterator[tuple[str, _Pairs]
         yield row, _pair_sessions(log.earlier, log.measured, [row])
     if len(rows) > 1:
         yield ALL, _pair_sessions(log.earlier, log.measured, rows)
-
-
-def _provenance(log: SessionLog, rows: Sequence[str]) -> Iterator[str]:
-    """Lines on the sessions that are in one run alone, and on what measured the others."""
-    assert log.earlier is not None
-    lone = [
-        f"{row} {pairs.only_old} before, {pairs.only_new} now"
-        for row, pairs in _groups(log, rows)
-        if row != ALL and pairs.only_old + pairs.only_new
-    ]
-    if lone:
-        yield f"In one run alone and left out, sessions: {'; '.join(lone)}."
-    keys = _pair_sessions(log.earlier, log.measured, rows).keys
-    codes = [Counter(run[key].code for key in keys) for run in (log.earlier, log.measured)]
-    named = [", ".join(f"{code} ({count} sessions)" for code, count in each.items()) for each in codes]
-    yield f"Code before: {named[0] or 'none'}; now: {named[1] or 'none'}."
 
 
 def _failures(what: Compared, pairs: _Pairs) -> tuple[list[Key], np.ndarray, np.ndarray]:
@@ -385,9 +332,11 @@ def _ratio(pairs: _Pairs, name: str) -> str:
 
 def _spread(ratio: np.ndarray) -> str:
     """Median of ratios [n], with its interval."""
+    from scipy.stats import quantile_test  # slow to import
+
     if not len(ratio):
         return "-"
-    low, high = median_interval(ratio)
+    low, high = quantile_test(ratio).confidence_interval(0.95)
     return f"{np.median(ratio):.3f} " + (f"[{low:.3f}-{high:.3f}]" if low == low else "[-]")
 
 
@@ -398,8 +347,12 @@ def _count(happens: Callable[[np.ndarray, np.ndarray], np.ndarray], pairs: _Pair
 
 def _changed(old: np.ndarray, new: np.ndarray) -> str:
     """Cured and new failures of sessions that fail [n] bool before and now."""
+    from scipy.stats import binomtest
+
     cured, appeared = int((old & ~new).sum()), int((new & ~old).sum())
-    return f"{cured}, {appeared} ({sign_test(cured, appeared):.2g})"
+    # That failures are cured as often as there are new ones: so many heads of as many tosses of a coin.
+    p = binomtest(appeared, cured + appeared).pvalue if cured + appeared else 1
+    return f"{cured}, {appeared} ({p:.2g})"
 
 
 def _median(values: np.ndarray) -> str:

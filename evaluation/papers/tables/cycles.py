@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from itertools import product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,19 +100,16 @@ class _Cycle(NamedTuple):
         return 1e6 * float(np.median(own)), percentile, 1e3 * float(own.max()), 1e3 * float(clock.max())
 
 
-def cycle_table(
-    sessions: Sequence[str] | None = None, rounds: int = 5, folder: Path = Path()
-) -> Iterator[str]:
+def cycle_table(sessions: Sequence[str] | None = None, rounds: int = 5) -> Iterator[str]:
     """The lines of the table, after all rounds.
 
     Args:
-        sessions: of `SESSIONS`; None: all. rounds: repeats, of which the median is taken. folder: of the
-            repository, which holds `configs`.
+        sessions: of `SESSIONS`; None: all. rounds: repeats, of which the median is taken.
 
     Raises:
         InputError: a recording cannot be read.
     """
-    cycles = _open_cycles(sessions, ("float64", "float32"), folder)
+    cycles = _open_cycles(sessions, ("float64", "float32"))
     rows = np.array([[(cycle.time(), *cycle.time_live()) for cycle in cycles] for _ in range(rounds)])
     yield markdown_header(COLUMNS)
     for cycle, found in zip(cycles, np.median(rows, axis=0).tolist(), strict=True):
@@ -122,11 +118,11 @@ def cycle_table(
         yield markdown_row([cycle.name, cycle.backend, cycle.precision, len(cycle.observations), *times])
 
 
-def profile_table(sessions: Sequence[str] | None = None, folder: Path = Path()) -> Iterator[str]:
+def profile_table(sessions: Sequence[str] | None = None) -> Iterator[str]:
     """The lines of a table of where the processor time of a replayed step goes, us, by part (`PARTS`). The
     selection runs on the thread of the session here. Profiling slows down Python, not compiled code, so its
     times are scaled to the sum of a session that is not profiled."""
-    cycles = _open_cycles(sessions, ("float64",), folder)
+    cycles = _open_cycles(sessions, ("float64",))
     columns = []
     for cycle in cycles:
         with _selecting_inline():
@@ -139,16 +135,14 @@ def profile_table(sessions: Sequence[str] | None = None, folder: Path = Path()) 
     yield markdown_row(["all", *(f"{sum(column.values()):.0f}" for column in columns)])
 
 
-def _open_cycles(
-    sessions: Sequence[str] | None, precisions: Sequence[Precision], folder: Path
-) -> list[_Cycle]:
+def _open_cycles(sessions: Sequence[str] | None, precisions: Sequence[Precision]) -> list[_Cycle]:
     """The compiled sessions of a table."""
     prepare_precision("float64")
     cycles = []
-    names = select_rows(sessions, SESSIONS, tuple(SESSIONS))
+    names = select_rows(sessions, SESSIONS)
     for name, backend, precision in product(names, BACKENDS, precisions):
         settings = [f"backend={backend}", f"session.precision={precision}"]
-        config: RunConfig = load_config(folder / SESSIONS[name], settings)
+        config: RunConfig = load_config(SESSIONS[name], settings)
         with open_observations(config) as (config, source):
             log = load_into_memory(source)
         observations = [observation_of(sample) for sample in log]

@@ -7,7 +7,7 @@ known and without alignment, beside those of dead reckoning.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -91,20 +91,10 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class GridFigures(NamedTuple):
-    """The figures of one session.
-
-    Attributes:
-        error, odometry: mean position error of the filter and of dead reckoning, m. wall_errors: [n] errors
-            of the wall directions given to the filter, rad. contacts: number of them that could give one.
-        map: AUC, Brier skill, Brier skill of free space alone, Chamfer map to walls and walls to map, m.
-    """
-
-    error: float
-    odometry: float
-    wall_errors: np.ndarray
-    contacts: int
-    map: tuple[float, ...]
+GridFigures = tuple[float, float, np.ndarray, int, list[float]]
+"""The figures of one session: mean position error of the filter and of dead reckoning, m; [n] errors of the
+wall directions given to the filter, rad; number of contacts that could give one; AUC, Brier skill, Brier
+skill of free space alone, Chamfer map to walls and walls to map, m."""
 
 
 def grid_table(
@@ -165,12 +155,12 @@ def measure_session(task: tuple[str, str, int]) -> GridFigures:
     scores = score_grid(drawn, true_grid(source.arena, drawn)).quantities
     names = ("map_auc", "map_brier_skill", "map_brier_skill_free", "map_chamfer_map", "map_chamfer_walls")
     values = [scores[name].value for name in names]
-    return GridFigures(
-        error=position_error(compose(start, online), truth),
-        odometry=position_error(integrate(moves, start), truth),
-        wall_errors=np.array([_wall_error(source.arena, pose, observation) for pose, observation in walls]),
-        contacts=sum(each.moment >= 2 and each.motion == MotionKind.FORWARD for each in readings),
-        map=tuple(np.nan if value is None else float(value) for value in values),
+    return (
+        position_error(compose(start, online), truth),
+        position_error(integrate(moves, start), truth),
+        np.array([_wall_error(source.arena, pose, observation) for pose, observation in walls]),
+        sum(each.moment >= 2 and each.motion == MotionKind.FORWARD for each in readings),
+        [np.nan if value is None else float(value) for value in values],
     )
 
 
@@ -188,10 +178,11 @@ def _wall_error(arena: Arena, pose: np.ndarray, observation: Observation) -> flo
 
 
 def _cells(found: Sequence[GridFigures]) -> list[str]:
-    error, odometry = (np.array([getattr(each, part) for each in found]) for part in ("error", "odometry"))
-    walls = np.degrees(np.concatenate([each.wall_errors for each in found]))
-    share = len(walls) / max(sum(each.contacts for each in found), 1)
-    auc, skill, free, to_walls, to_map = np.nanmean([each.map for each in found], axis=0)
+    errors, reckoned, wall_errors, contacts, maps = zip(*found, strict=True)
+    error, odometry = np.array(errors), np.array(reckoned)
+    walls = np.degrees(np.concatenate(wall_errors))
+    share = len(walls) / max(sum(contacts), 1)
+    auc, skill, free, to_walls, to_map = np.nanmean(maps, axis=0)
     wall = f"{walls.mean():.1f} degrees, {(walls > 15.0).mean():.0%}, {share:.0%}"
     return [
         f"{odometry.mean():.3f} m",

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -24,7 +24,7 @@ from evaluation.papers.tables.buildings import HARM_FACTOR, HARM_MARGIN
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import Recording, real_recordings
 from evaluation.papers.tables.spoilt_maps import spoilt_maps
-from evaluation.papers.tables.touch_table import MAIN, ROWS
+from evaluation.papers.tables.touch_table import MAIN, NOISE, ROWS
 from evaluation.papers.trial_sessions import run_recording
 from evaluation.studies.executor import run_tasks
 from evaluation.studies.perturbation import miscalibrate
@@ -32,7 +32,6 @@ from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import DOUBTED, INTERCEPT, WEIGHTS, health_features
 from ratslam.runs.settings.run_config import RunConfig
-from robot.simulation.head.odometry_errors import OdometryConfig
 
 FIRST_MAZE = 31000
 RIDGE = 2.0
@@ -40,22 +39,15 @@ RIDGE = 2.0
 CLEAR = 1.25
 """Ratio of the errors of map and odometry beyond which one is clearly better."""
 EXPLORATION = {"path": {"explore": 900}}
-NOISE = OdometryConfig()
-
-
-def _noise(factor: float) -> dict[str, Any]:
-    """Settings of the odometry with this factor on its noise."""
-    return {"odometry": {"length": factor * NOISE.length, "heading": factor * NOISE.heading}}
-
-
 TOUCH: dict[str, dict[str, Any]] = {
     "main": MAIN,
     "exploration": EXPLORATION,
-    "open arena": MAIN | EXPLORATION | {"maze": {"share": 0.08}},
-    "tree": MAIN | EXPLORATION | {"maze": {"kind": "tree"}},
-    "good odometry": EXPLORATION | _noise(0.25),
+    "open arena": ROWS["open arena"].simulation | EXPLORATION,
+    "tree": ROWS["tree"].simulation | EXPLORATION,
+    "good odometry": EXPLORATION
+    | {"odometry": {"length": 0.25 * NOISE.length, "heading": 0.25 * NOISE.heading}},
     "white": ROWS["white"].simulation,
-    "noise x 2": MAIN | _noise(2.0),
+    "noise x 2": ROWS["noise x 2"].simulation,
 }
 """Settings `simulation` of the whisker sessions."""
 REAL = {
@@ -71,41 +63,32 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class JudgedMaps(NamedTuple):
-    """The maps of sessions, n in all.
-
-    Attributes:
-        features: [n, 5] of `health_features`. ratio: [n] error over odometry's. bad: [n] bool. closures: [n].
-    """
-
-    features: np.ndarray
-    ratio: np.ndarray
-    bad: np.ndarray
-    closures: np.ndarray
+RATIO, BAD, CLOSURES = -3, -2, -1
+"""Columns of the maps of sessions, [n, 8], after those of `health_features`: error over odometry's, whether
+it is bad, number of closures."""
 
 
-def health_table(sessions: int = 2, workers: int = 0, folder: Path = Path()) -> Iterator[str]:
+def health_table(sessions: int = 2, workers: int = 0) -> Iterator[str]:
     """The lines of the table.
 
     Args:
-        sessions: of each row; recordings are perturbed copies but the first. folder: of the repository.
+        sessions: of each row; recordings are perturbed copies but the first.
     """
     rows = [*TOUCH, *(REAL if real_recordings() else ())]
-    tasks = [(row, number, folder) for row in rows for number in range(sessions)]
+    tasks = [(row, number) for row in rows for number in range(sessions)]
     found = list(run_tasks(_judge_session, tasks, workers=workers))
-    weights, final = (fit_weights(_together(maps)) for maps in (found[0::2], found))
+    weights, final = (fit_weights(np.concatenate(maps)) for maps in (found[0::2], found))
     constants = np.array([INTERCEPT, *WEIGHTS])
     yield markdown_header(COLUMNS)
     for row in rows:
-        maps = _together([one for task, one in zip(tasks, found, strict=True) if task[0] == row])
-        yield _line(row, maps, constants)
-    yield _line("all", _together(found), constants)
-    yield _line("even, fitted on these", _together(found[0::2]), weights)
-    yield _line("odd, fitted on even ones", _together(found[1::2]), weights)
+        yield _line(row, [one for task, one in zip(tasks, found, strict=True) if task[0] == row], constants)
+    yield _line("all", found, constants)
+    yield _line("even, fitted on these", found[0::2], weights)
+    yield _line("odd, fitted on even ones", found[1::2], weights)
     yield f"\nIntercept and weights fitted on all sessions: {', '.join(f'{w:.2f}' for w in final)}."
 
 
-def _judge_session(task: tuple[str, int, Path]) -> JudgedMaps:
+def _judge_session(task: tuple[str, int]) -> np.ndarray:
     """Runs a session, of a row and a number, and judges its spoilt maps."""
     number = task[1]
     config, touch = task_config(*task)
@@ -129,12 +112,11 @@ def _judge_session(task: tuple[str, int, Path]) -> JudgedMaps:
         if closures:
             after = error(solution.fit.poses)
             rows.append((*health_features(graph, solution), after / before, after > limit, closures))
-    values = np.array(rows, float).reshape(len(rows), -1)
-    return JudgedMaps(values[:, :-3], values[:, -3], values[:, -2] > 0, values[:, -1])
+    return np.array(rows, float).reshape(len(rows), len(WEIGHTS) + 3)
 
 
-def task_config(row: str, number: int, folder: Path) -> tuple[RunConfig, bool]:
-    """The configuration of a session, and whether it is a whisker session; folder: of the repository."""
+def task_config(row: str, number: int) -> tuple[RunConfig, bool]:
+    """The configuration of a session, and whether it is a whisker session."""
     if row in TOUCH:
         maze = FIRST_MAZE + number
         simulation = TOUCH[row]
@@ -144,45 +126,35 @@ def task_config(row: str, number: int, folder: Path) -> tuple[RunConfig, bool]:
     config, file = REAL[row]
     settings = (f"recording.file={(real_recordings() or Path()).absolute() / file}",) if file else ()
     recording = Recording(row, config, settings, real=True)
-    return recording.configuration(folder, "session.reserve=1024"), False
+    return recording.configuration("session.reserve=1024"), False
 
 
-def fit_weights(maps: JudgedMaps) -> np.ndarray:
+def fit_weights(maps: np.ndarray) -> np.ndarray:
     """[6] intercept and weights of a logistic regression with a ridge on standardised features."""
-    mean, sd = maps.features.mean(axis=0), maps.features.std(axis=0) + 1e-9
-    columns = np.column_stack([np.ones(len(maps.bad)), (maps.features - mean) / sd])
+    features, bad = maps[:, :RATIO], maps[:, BAD] > 0
+    mean, sd = features.mean(axis=0), features.std(axis=0) + 1e-9
+    columns = np.column_stack([np.ones(len(bad)), (features - mean) / sd])
 
     def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
         z, ridge = columns @ weights, RIDGE * weights * (np.arange(len(weights)) > 0)
-        value = np.logaddexp(0, z).sum() - z[maps.bad].sum() + ridge @ weights / 2
-        return float(value), columns.T @ (expit(z) - maps.bad) + ridge
+        value = np.logaddexp(0, z).sum() - z[bad].sum() + ridge @ weights / 2
+        return float(value), columns.T @ (expit(z) - bad) + ridge
 
     weights = minimize(loss, np.zeros(columns.shape[1]), jac=True).x
     scaled = weights[1:] / sd
     return np.array([weights[0] - scaled @ mean, *scaled])
 
 
-def _line(name: str, maps: JudgedMaps, weights: np.ndarray) -> str:
+def _line(name: str, sessions: Sequence[np.ndarray], weights: np.ndarray) -> str:
     """A row of the table with an intercept and weights [6]."""
-    worse = expit(weights[0] + maps.features @ weights[1:])
-    clear = (maps.ratio > CLEAR) | (maps.ratio < 1 / CLEAR)
-    doubted = worse > DOUBTED
-    return markdown_row(
-        [
-            name, len(maps.bad), int(maps.bad.sum()), _auc(worse, maps.bad),
-            _auc(worse[clear], maps.bad[clear]), _auc(-maps.closures, maps.bad),
-            _share(doubted[~maps.bad]), _share(~doubted[maps.bad]),
-        ]
-    )  # fmt: skip
+    maps = np.concatenate(sessions)
+    ratio, bad = maps[:, RATIO], maps[:, BAD] > 0
+    worse = expit(weights[0] + maps[:, :RATIO] @ weights[1:])
+    clear, doubted = (ratio > CLEAR) | (ratio < 1 / CLEAR), worse > DOUBTED
+    areas = _auc(worse, bad), _auc(worse[clear], bad[clear]), _auc(-maps[:, CLOSURES], bad)
+    shares = (f"{happened.sum()} of {len(happened)}" for happened in (doubted[~bad], ~doubted[bad]))
+    return markdown_row([name, len(bad), int(bad.sum()), *areas, *shares])
 
 
 def _auc(values: np.ndarray, bad: np.ndarray) -> str:
     return f"{auc(values[~bad], values[bad]):.3f}" if bad.any() and not bad.all() else "-"
-
-
-def _share(happened: np.ndarray) -> str:
-    return f"{happened.sum()} of {len(happened)}"
-
-
-def _together(found: Sequence[JudgedMaps]) -> JudgedMaps:
-    return JudgedMaps(*(np.concatenate(parts) for parts in zip(*found, strict=True)))

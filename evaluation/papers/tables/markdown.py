@@ -17,8 +17,10 @@ def markdown_header(columns: Sequence[str]) -> str:
     return f"{markdown_row(columns)}\n{'|---' * len(columns)}|"
 
 
-def select_rows(names: Sequence[str] | None, rows: Mapping[str, object], default: Sequence[str]) -> list[str]:
-    """The chosen rows of a table.
+def select_rows(
+    names: Sequence[str] | None, rows: Mapping[str, object], default: Sequence[str] = ()
+) -> list[str]:
+    """The chosen rows of a table; all of them unless others are the default.
 
     Raises:
         InputError: a name that is not a row.
@@ -26,4 +28,4 @@ def select_rows(names: Sequence[str] | None, rows: Mapping[str, object], default
     for name in names or ():
         if name not in rows:
             raise InputError("--rows", repr(name), f"one of: {'; '.join(rows)}")
-    return list(names or default)
+    return list(names or default or rows)

@@ -15,12 +15,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import circulant
 
 from evaluation.papers.tables.cycles import SESSIONS
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
@@ -139,8 +139,8 @@ class _NumpyNetwork:
 
     def __init__(self, n: int, k: int = 36) -> None:
         self.n, self.k = n, k
-        self.excite = [_circulant(_gaussian(7, 1.0), size) for size in (k, n, n)]
-        self.inhibit = [_circulant(_gaussian(5, 2.0), size) for size in (k, n, n)]
+        self.excite = [_circulant(7, 1.0, size) for size in (k, n, n)]
+        self.inhibit = [_circulant(5, 2.0, size) for size in (k, n, n)]
         self.activity = np.zeros((k, n, n))
         self.activity[k // 2, n // 2, n // 2] = 1
 
@@ -175,15 +175,12 @@ class _NumpyNetwork:
         return means[2], means[1], means[0]
 
 
-def _gaussian(width: int, sigma: float) -> np.ndarray:
-    weight = np.exp(-((np.arange(width) - width // 2) ** 2) / (2 * sigma**2))
-    return weight / weight.sum()
-
-
-def _circulant(kernel: np.ndarray, size: int) -> np.ndarray:
-    return np.sum(
-        [w * np.roll(np.eye(size), len(kernel) // 2 - t, axis=0) for t, w in enumerate(kernel)], axis=0
-    )
+def _circulant(width: int, sigma: float, size: int) -> np.ndarray:
+    """[size, size] the circular convolution with a Gaussian cut off at `width` cells."""
+    at = np.arange(width) - width // 2
+    column, weight = np.zeros(size), np.exp(-(at**2) / (2 * sigma**2))
+    column[at] = weight / weight.sum()
+    return circulant(column)
 
 
 def _convolve(p: np.ndarray, along: list[np.ndarray]) -> np.ndarray:
@@ -204,19 +201,19 @@ SINGLE = 400
 """Steps of a single network."""
 
 
-def batch_table(sets: int, sessions: int, steps: int, rounds: int, folder: Path = Path()) -> Iterator[str]:
+def batch_table(sets: int, sessions: int, steps: int, rounds: int) -> Iterator[str]:
     """The lines of the table, each as soon as it is timed.
 
     Args:
         sets, sessions: number in one call on a GPU; on the processor a fifth of the sets and `RECORDED`
             sessions, as its time for each does not depend on their number. steps: of a session. rounds:
-            repeats, of which the median is taken. folder: of the repository, which holds `configs`.
+            repeats, of which the median is taken.
     """
     prepare_precision("float64")
     yield markdown_header(["what is computed", "device", "us a step of each"])
     core = jax.devices("cpu")[0]
     with jax.default_device(core):
-        backend, recordings = _record_circuits(steps, folder)
+        backend, recordings = _record_circuits(steps)
     for device in dict.fromkeys([jax.devices()[0], core]):
         gpu = device.platform != "cpu"
         name = device.device_kind if gpu else "one core"
@@ -251,12 +248,12 @@ def batch_table(sets: int, sessions: int, steps: int, rounds: int, folder: Path 
     yield markdown_row([what, "one core", f"{us:.1f}"])
 
 
-def _record_circuits(steps: int, folder: Path) -> tuple[RecallBackend, list[Recording]]:
+def _record_circuits(steps: int) -> tuple[RecallBackend, list[Recording]]:
     """The backend and recordings of the first steps of `RECORDED` whisker sessions of ten circuits whose maps
     need as many pose cells."""
     recordings: list[Recording] = []
     for seed in count():
-        config = load_config(folder / SESSIONS["circuits"], [f"simulation.seed={seed}"])
+        config = load_config(SESSIONS["circuits"], [f"simulation.seed={seed}"])
         with open_observations(config) as (config, source):
             log = load_into_memory(source)
         observations = [observation_of(sample) for sample in log][:steps]

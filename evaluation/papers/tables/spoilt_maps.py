@@ -7,7 +7,7 @@ truth, along which odometry moved alike: the one of `_ATTEMPTS` random pairs tha
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,37 +23,20 @@ _ATTEMPTS = 300
 """Pairs of stretches tried for one false sequence."""
 
 
-class Recipe(NamedTuple):
-    """How a map is spoilt.
-
-    Attributes:
-        kept: share of its accepted sequences that stay. more: number of refused ones accepted. least: least
-            evidence of the refused ones that are all accepted; None: not. false: whether false sequences
-            are added, `alike`: such as look alike. robust: whether sequences that disagree lose weight.
-    """
-
-    name: str
-    kept: float = 1.0
-    more: int = 0
-    least: float | None = None
-    false: bool = False
-    alike: bool = True
-    robust: bool = True
-
-
-_RECIPES = (
-    Recipe("all accepted", least=2.0, robust=False),
-    Recipe("half", kept=0.5),
-    Recipe("false, alike", false=True, robust=False),
-    Recipe("false, random", false=True, alike=False, robust=False),
-    Recipe("false, alike", false=True, robust=False),
-    Recipe("half and three refused", kept=0.5, more=3),
-    Recipe("false, random", false=True, alike=False, robust=False),
-    Recipe("few", kept=0.15),
-    Recipe("only false", kept=0.0, false=True, robust=False),
-    Recipe("some and false, robust", kept=0.3, false=True),
-    Recipe("all accepted, robust", least=4.0),
+_RECIPES: tuple[tuple[str, dict[str, Any], bool], ...] = (
+    ("all accepted", {"least": 2.0}, False),
+    ("half", {"kept": 0.5}, True),
+    ("false, alike", {"choices": _ATTEMPTS}, False),
+    ("false, random", {"choices": 1}, False),
+    ("false, alike", {"choices": _ATTEMPTS}, False),
+    ("half and three refused", {"kept": 0.5, "more": 3}, True),
+    ("false, random", {"choices": 1}, False),
+    ("few", {"kept": 0.15}, True),
+    ("only false", {"kept": 0.0, "choices": _ATTEMPTS}, False),
+    ("some and false, robust", {"kept": 0.3, "choices": _ATTEMPTS}, True),
+    ("all accepted, robust", {"least": 4.0}, True),
 )
+"""Names, arguments of `spoil`, and whether sequences that disagree lose weight."""
 
 
 def spoilt_maps(map: KeyframeMap, truth: np.ndarray, seed: int) -> Iterator[tuple[str, MapSolution]]:
@@ -65,32 +48,46 @@ def spoilt_maps(map: KeyframeMap, truth: np.ndarray, seed: int) -> Iterator[tupl
     graph, final = map.keyframes(), map.solution()
     random = stream(seed, "spoilt_maps")
     yield "final", final
-    for recipe in _RECIPES:
-        log = spoil(graph, final.log, truth, recipe, random)
+    for name, changes, robust in _RECIPES:
+        log = spoil(graph, final.log, truth, random, **changes)
         if len(log.accepted_rows()):
-            yield recipe.name, solved_anew(graph, log, final, recipe.robust)
+            yield name, solved_anew(graph, log, final, robust)
 
 
 def spoil(
-    graph: KeyframeGraph, log: ClosureLog, truth: np.ndarray, recipe: Recipe, random: np.random.Generator
+    graph: KeyframeGraph,
+    log: ClosureLog,
+    truth: np.ndarray,
+    random: np.random.Generator,
+    *,
+    kept: float = 1.0,
+    more: int = 0,
+    least: float = np.inf,
+    choices: int = 0,
 ) -> ClosureLog:
-    """A copy of a log with other verdicts and, where the session has room for them, false sequences."""
+    """A copy of a log with other verdicts and, where the session has room for them, false sequences.
+
+    Args:
+        truth: see `spoilt_maps`. kept: share of the accepted sequences that stay. more: number of refused
+            ones accepted. least: evidence from which on refused ones are accepted. choices: pairs of
+            stretches of which the one that looks most alike becomes a false sequence; 0: there are none.
+    """
     log = log.copy()
     verdicts, long = log.verdicts().copy(), log.sizes() >= 2
     refused = np.flatnonzero(long & (verdicts != Verdict.ACCEPTED))
     for sequence in np.flatnonzero(verdicts == Verdict.ACCEPTED).tolist():
-        if random.random() > recipe.kept:
+        if random.random() > kept:
             log.judge(sequence, Verdict.OPEN)
-    chosen = random.choice(refused, min(recipe.more, len(refused)), replace=False)
-    if recipe.least is not None:
-        chosen = refused[log.scores()[refused] >= recipe.least]
+    chosen = random.choice(refused, min(more, len(refused)), replace=False)
+    if np.isfinite(least):
+        chosen = refused[log.scores()[refused] >= least]
     for sequence in chosen.tolist():
         log.judge(sequence, Verdict.ACCEPTED)
-    if recipe.false:
+    if choices:
         # 1 to 4 false sequences of 6 to 39 candidates.
         count, length = (int(random.integers(low, high + 1)) for low, high in ((1, 4), (6, 39)))
         for _ in range(count):
-            _add_false_sequence(graph, log, truth, length, random, _ATTEMPTS if recipe.alike else 1)
+            _add_false_sequence(graph, log, truth, length, random, choices)
     return log
 
 

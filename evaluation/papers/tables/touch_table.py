@@ -198,7 +198,7 @@ def touch_table(
     sessions: int | None = None,
     workers: int = 0,
     backend: str = "recall",
-    files: Files = Files(),  # noqa: B008
+    files: Files = (None, None),
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its sessions are done.
 

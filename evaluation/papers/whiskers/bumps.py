@@ -15,7 +15,7 @@ import numpy as np
 from evaluation.metrics.trajectory import align, ate
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.whiskers.recordings import require_recordings
+from evaluation.papers.tables.recordings import require_recordings
 from evaluation.plots import style
 from ratslam.core.estimates import GridDrawing
 from ratslam.core.session import Session
@@ -30,23 +30,18 @@ from tactile.base.se2 import between, compose, integrate
 from tactile.base.types import Observation
 
 
-class WallDistances(NamedTuple):
-    """Distances from the robot's true position to the nearest wall, m: [E] at the first reading of each
-    contact, and [T] at all readings."""
-
-    contact: np.ndarray
-    all: np.ndarray
-
-
-def wall_distances(position: np.ndarray, pressed: np.ndarray, walls: np.ndarray) -> WallDistances:
-    """The distances along a true path.
+def wall_distances(
+    position: np.ndarray, pressed: np.ndarray, walls: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances along a true path to the nearest wall, m: [E] at the first reading of each contact, and [T]
+    at all readings.
 
     Args:
         position: [T, 2], m. pressed: [T] bool, a bumper is pressed. walls: [W, 4] ends x1, y1, x2, y2, m.
     """
     distance = segment_distance(walls, position).min(axis=1)
     begins = pressed & ~np.concatenate([[False], pressed[:-1]])
-    return WallDistances(distance[begins], distance)
+    return distance[begins], distance
 
 
 CONFIG = Path("configs/create_bumps.yaml")
@@ -94,11 +89,7 @@ class BumpsResult(NamedTuple):
 
 
 def _measure(folder: Path) -> BumpsResult:
-    """Maps the drive with every variant and seed.
-
-    Raises:
-        InputError: a recording is missing or damaged.
-    """
+    """Maps the drive with every variant and seed."""
     walls = require_recordings(folder, *(f"data/create_lab_{name}.csv" for name in FILES))[-1]
     with open_observations(load_config(CONFIG)) as (_, source):
         samples = list(source)
@@ -125,7 +116,7 @@ def _measure(folder: Path) -> BumpsResult:
     touching, known = np.array([each.contact.any() for each in observations]), _known(truth)
     return BumpsResult(
         final, online, _odometry_errors(observations, truth), (first, second),
-        wall_distances(truth[known, :2], touching[known], segments).contact,
+        wall_distances(truth[known, :2], touching[known], segments)[0],
         truth, _aligned(_dead_reckoning(observations), truth), _aligned(middle[2], truth),
         (middle[3], align(middle[2][known], truth[known])), segments,
     )  # fmt: skip
@@ -189,12 +180,9 @@ def _treat(name: str, observations: list[Observation], seed: int) -> list[Observ
         return correct_observations(OTHER_CREATES, observations)
     if name != "bumps shuffled in time":
         return observations
-    order = stream(seed, "shuffle").permutation(len(observations))
-    bumps = [observations[k] for k in order]
-    return [
-        each._replace(contact=bump.contact, point=bump.point)
-        for each, bump in zip(observations, bumps, strict=True)
-    ]
+    bumps = [observations[k] for k in stream(seed, "shuffle").permutation(len(observations))]
+    pairs = zip(observations, bumps, strict=True)
+    return [each._replace(contact=bump.contact, point=bump.point) for each, bump in pairs]
 
 
 def _run(
@@ -218,13 +206,11 @@ def _odometry_errors(observations: list[Observation], truth: np.ndarray) -> dict
         motion[pressed] *= [1 - slip, 1 - slip, 1 - slip / 2]
         return _ate(integrate(motion), truth)
 
-    corrected = correct_observations(OTHER_CREATES, observations)
+    corrected, drifts = correct_observations(OTHER_CREATES, observations), np.arange(-0.5, 0.5, 0.02)
     return {
         "odometry": error(),
         "odometry, turn scale fitted to the truth": min(error(turn=s) for s in np.arange(0.8, 1.3, 0.01)),
-        "odometry, heading drift fitted to the truth": min(
-            error(drift=d / 60) for d in np.arange(-0.5, 0.5, 0.02)
-        ),
+        "odometry, heading drift fitted to the truth": min(error(drift=d / 60) for d in drifts),
         "odometry without forward motion and half of the turn in pressed steps": error(slip=1.0),
         f"odometry, {OTHERS}": _ate(_dead_reckoning(corrected), truth),
     }

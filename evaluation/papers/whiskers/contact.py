@@ -7,26 +7,18 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from enum import IntEnum
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from scipy.ndimage import uniform_filter1d
 
 from evaluation.papers.figure import Figure
-from evaluation.papers.whiskers.drift import (
-    Decide,
-    Snippet,
-    StreamScore,
-    add_scores,
-    fit_free_model,
-    score_stream,
-    simulate_stream,
-)
-from evaluation.papers.whiskers.recordings import REACH, require_recordings
+from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.recordings import REACH, require_recordings
+from evaluation.papers.whiskers.drift import Decide, Snippet, fit_free_model, score_stream, simulate_stream
 from evaluation.plots import style
 from robot.recordings.real_whiskers import WHISKERS, ReachConfig, ReachRecord, read_reach
 from tactile.base.errors import InputError
@@ -55,37 +47,21 @@ BLOCK = 2400
 FOLDER = Path(__file__).with_name("annotations")
 """A CSV file for each annotator: whisker, start_row, end_row (exclusive), label; it covers every row of every
 whisker."""
+LABELS = ("free", "contact", "unclear")
+"""Marks of an annotator, stored by their numbers."""
+FREE, CONTACT, UNCLEAR = range(3)
 
 
-class Label(IntEnum):
-    """A mark of an annotator."""
-
-    FREE = 0
-    CONTACT = 1
-    UNCLEAR = 2
-
-
-class _Score(NamedTuple):
-    """Contacts found against marks. A figure without rows to divide by is NaN.
-
-    Attributes:
-        precision, recall: of the rows that are clear. strict_precision, strict_recall: of all rows, every
-            unclear one counted as wrong. unclear: share of unclear rows.
-    """
-
-    precision: float
-    recall: float
-    strict_precision: float
-    strict_recall: float
-    unclear: float
-
-
-def read_annotation(path: Path, whiskers: Sequence[str], rows: int) -> np.ndarray:
-    """[rows, W] int8, the `Label` of each row.
+def read_annotators(folder: Path, whiskers: Sequence[str], rows: int) -> dict[str, np.ndarray]:
+    """The marks of each annotator, [rows, W] int8 by `LABELS`; none where the folder has no CSV file.
 
     Raises:
-        InputError: the file is not such a table, or marks a row twice or not at all.
+        InputError: a file is not such a table, or marks a row twice or not at all.
     """
+    return {path.stem: _read_annotation(path, whiskers, rows) for path in sorted(folder.glob("*.csv"))}
+
+
+def _read_annotation(path: Path, whiskers: Sequence[str], rows: int) -> np.ndarray:
     with path.open(encoding="utf-8", newline="") as file:
         table = csv.DictReader(file)
         if set(table.fieldnames or ()) != {"whisker", "start_row", "end_row", "label"}:
@@ -95,9 +71,9 @@ def read_annotation(path: Path, whiskers: Sequence[str], rows: int) -> np.ndarra
     for line, stretch in enumerate(stretches, start=2):
         where = f"{path}:{line}"
         try:
-            column, label = whiskers.index(stretch["whisker"]), Label[stretch["label"].upper()]
+            column, label = whiskers.index(stretch["whisker"]), LABELS.index(stretch["label"].lower())
             first, last = int(stretch["start_row"]), int(stretch["end_row"])
-        except (ValueError, KeyError, AttributeError, TypeError):
+        except (ValueError, AttributeError, TypeError):
             expected = f"one of {', '.join(whiskers)}, two row numbers, and contact, free or unclear"
             raise InputError(where, str(stretch), expected) from None
         if not 0 <= first < last <= rows or (marks[first:last, column] >= 0).any():
@@ -109,64 +85,38 @@ def read_annotation(path: Path, whiskers: Sequence[str], rows: int) -> np.ndarra
     return marks
 
 
-def read_annotators(folder: Path, whiskers: Sequence[str], rows: int) -> dict[str, np.ndarray]:
-    """The marks [rows, W] of each annotator; none where the folder has no CSV file."""
-    return {path.stem: read_annotation(path, whiskers, rows) for path in sorted(folder.glob("*.csv"))}
+def score_contacts(contact: np.ndarray, marks: np.ndarray) -> tuple[float, ...]:
+    """Scores contacts found, [...] bool, against marks of the same shape.
 
-
-def merge_marks(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The marks on which two annotators agree; unclear where they differ or either says so."""
-    return np.where(first == second, first, Label.UNCLEAR)
-
-
-def score_contacts(contact: np.ndarray, marks: np.ndarray) -> _Score:
-    """Scores contacts found, [...] bool, against marks of the same shape."""
-    unclear = marks == Label.UNCLEAR
-    right = int((contact & (marks == Label.CONTACT)).sum())
-    false, missed = (
-        int(wrong.sum()) for wrong in (contact & (marks == Label.FREE), ~contact & (marks == Label.CONTACT))
-    )
-    doubtful, silent = int((contact & unclear).sum()), int((~contact & unclear).sum())
-    return _Score(
-        precision=_share(right, right + false),
-        recall=_share(right, right + missed),
-        strict_precision=_share(right, right + false + doubtful),
-        strict_recall=_share(right, right + missed + silent),
-        unclear=float(unclear.mean()),
-    )
-
-
-def _share(part: int, whole: int) -> float:
-    return part / whole if whole else float("nan")
-
-
-class _MarkResult(NamedTuple):
-    """Scores against two annotators.
-
-    Attributes:
-        annotators: their names. agreement: share of rows with the same mark.
-        unclear: share of rows unclear to either or marked differently.
-        whiskers: by rule, the score of each whisker. pooled: by rule, of the whiskers that touch.
+    Returns:
+        precision and recall of the rows that are clear; the same of all rows, every unclear one counted as
+        wrong; share of unclear rows. NaN without rows to divide by.
     """
-
-    annotators: tuple[str, ...]
-    agreement: float
-    unclear: float
-    whiskers: dict[str, list[_Score]]
-    pooled: dict[str, _Score]
+    marked, unclear = marks == CONTACT, marks == UNCLEAR
+    right = int((contact & marked).sum())
+    false, missed, doubtful, silent = (
+        int(rows.sum())
+        for rows in (
+            contact & (marks == FREE),
+            ~contact & marked,
+            contact & unclear,
+            ~contact & unclear,
+        )
+    )
+    wholes = right + false, right + missed, right + false + doubtful, right + missed + silent
+    return (*(right / whole if whole else np.nan for whole in wholes), float(unclear.mean()))
 
 
 class _ContactResult(NamedTuple):
     """Contacts of T rows of W whiskers.
 
     Attributes:
-        whiskers: names. away: [W] largest departure of a channel from its free mean, in noise.
-        contact, fixed: [T, W] bool, by the tracked baseline and by the 20-sd rule. bent: [W] bool.
-        baseline: [T, W, K]. never: [W] bool, whiskers that show no contact.
-        tripled: by rule. hours: by hours and rule. marks: None without two annotators.
+        away: [W] largest departure of a channel from its free mean, in noise. contact, fixed: [T, W] bool, by
+            the tracked baseline and by the 20-sd rule. bent: [W] bool. baseline: [T, W, K]. never: [W] bool,
+            whiskers that show no contact. streams: scores by stream and rule, see `score_stream`. marks:
+            lines of the scores against the annotators.
     """
 
-    whiskers: tuple[str, ...]
     config: ReachConfig
     record: ReachRecord
     free: FreeBaseline
@@ -176,29 +126,32 @@ class _ContactResult(NamedTuple):
     fixed: np.ndarray
     baseline: np.ndarray
     never: np.ndarray
-    tripled: dict[str, StreamScore]
-    hours: dict[int, dict[str, StreamScore]]
-    marks: _MarkResult | None
+    streams: dict[str, dict[str, np.ndarray]]
+    marks: list[str]
 
 
 def _list_contacts(result: _ContactResult) -> list[str]:
     """The tables of the page."""
-    parts = (_whisker_table(result), _hour_table(result), _mark_table(result), _sentences(result))
+    hours = [markdown_header(
+        ("stream", "rule", "contacts longer than 0.1 s", "missed", "false contacts", "share of free rows")
+    )]  # fmt: skip
+    for stream, scores in result.streams.items():
+        for rule, (contacts, missed, false, wrong, free) in scores.items():
+            hours.append(markdown_row([stream, rule, contacts, missed, false, f"{wrong / free:.2g}"]))
+    parts = (_whisker_table(result), hours, result.marks, _sentences(result))
     return [line for part in parts for line in ("", *part)][1:]
 
 
 def _whisker_table(result: _ContactResult) -> list[str]:
     half = len(result.contact) // 2
     halves = [part.mean(axis=0) for part in (result.contact[:half], result.contact[half:])]
-    lines = [
-        "| whisker | in contact, first half | second half | contacts | 20-sd rule | contacts | remark |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for w, name in enumerate(result.whiskers):
+    columns = "in contact, first half", "second half", "contacts", "20-sd rule", "contacts", "remark"
+    lines = [markdown_header(("whisker", *columns))]
+    for w, name in enumerate(WHISKERS):
         tracked, fixed = (len(true_runs(found[:, w])) for found in (result.contact, result.fixed))
         early, late = (f"{part[w]:.1%}" for part in halves)
         share = f"{result.fixed[:, w].mean():.1%}"
-        lines.append(f"| {name} | {early} | {late} | {tracked} | {share} | {fixed} | {_remark(result, w)} |")
+        lines.append(markdown_row([name, early, late, tracked, share, fixed, _remark(result, w)]))
     return lines
 
 
@@ -214,48 +167,6 @@ def _remark(result: _ContactResult, whisker: int) -> str:
         travel = np.linalg.norm(np.diff(result.record.position[row:], axis=0), axis=1).sum()
         parts.append(f"away from row {row} to the end, {travel:.2f} m: touching or bent")
     return "; ".join(parts)
-
-
-def _hour_table(result: _ContactResult) -> list[str]:
-    lines = [
-        "| stream | rule | contacts longer than 0.1 s | missed | false contacts | share of free rows |",
-        "|---|---|---|---|---|---|",
-    ]
-    for rule, score in result.tripled.items():
-        lines.append(_stream_line("the record, each baseline times 3", rule, score))
-    for hours, scores in result.hours.items():
-        stream = f"{hours} h of the fitted drift"
-        lines += [_stream_line(stream, rule, score) for rule, score in scores.items()]
-    return lines
-
-
-def _stream_line(stream: str, rule: str, score: StreamScore) -> str:
-    share = f"{score.wrong / score.free:.2g}"
-    return f"| {stream} | {rule} | {score.contacts} | {score.missed} | {score.false} | {share} |"
-
-
-def _mark_table(result: _ContactResult) -> list[str]:
-    marks = result.marks
-    if marks is None:
-        return ["Precision and recall: not annotated."]
-    lines = [
-        f"Annotators {' and '.join(marks.annotators)}: agreement {marks.agreement:.1%} of rows, unclear "
-        f"{marks.unclear:.1%} (goal: at most 15 %).",
-        "",
-        "| whisker | rule | unclear | precision | recall | unclear counted as wrong: precision | recall |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for rule, score in marks.pooled.items():
-        lines.append(_mark_line("**those that touch**", rule, score))
-    for rule, scores in marks.whiskers.items():
-        lines += [_mark_line(name, rule, one) for name, one in zip(result.whiskers, scores, strict=True)]
-    return lines
-
-
-def _mark_line(name: str, rule: str, score: _Score) -> str:
-    figures = (score.precision, score.recall, score.strict_precision, score.strict_recall)
-    shown = " | ".join("-" if np.isnan(figure) else f"{figure:.3f}" for figure in figures)
-    return f"| {name} | {rule} | {score.unclear:.1%} | {shown} |"
 
 
 def _sentences(result: _ContactResult) -> list[str]:
@@ -282,8 +193,8 @@ def _draw_contacts(result: _ContactResult, png: Path) -> None:
     line = "magnetic whiskers on an arm; 20 sd: rule of Salman & Pearson 2016, mean and sd of the first 0.5 s"
     figure = style.new_figure(7.6, "Contact on an arm in clutter", line)
     _draw_rows(style.add_axes(figure, 0.75, 3.0, 7.0, 3.4), result)
-    _draw_release(style.add_axes(figure, 0.75, 0.55, 3.1, 1.75), result)
-    _draw_drift(style.add_axes(figure, 4.7, 0.55, 3.05, 1.75), result)
+    let_go = style.add_axes(figure, 0.75, 0.55, 3.1, 1.75)
+    _draw_signals(let_go, style.add_axes(figure, 4.7, 0.55, 3.05, 1.75), result)
     figure.savefig(png)
 
 
@@ -292,11 +203,11 @@ def _draw_rows(axes: Axes, result: _ContactResult) -> None:
     rate = result.config.rate
     colours = (style.BLUE, style.VERMILLION)
     for found, height, colour in zip((result.contact, result.fixed), (-0.2, 0.2), colours, strict=True):
-        for w in range(len(result.whiskers)):
+        for w in range(len(WHISKERS)):
             bars = [(first / rate, (last - first) / rate) for first, last in true_runs(found[:, w])]
             axes.broken_barh(bars, (w + height - 0.17, 0.34), color=colour, lw=0)
     dirty = result.free.dirty
-    names = [f"{name}*" if w in dirty else name for w, name in enumerate(result.whiskers)]
+    names = [f"{name}*" if w in dirty else name for w, name in enumerate(WHISKERS)]
     axes.set_yticks(range(len(names)), names)
     axes.set(xlim=(0, len(result.contact) / rate), ylim=(len(names) - 0.5, -0.5))
     style.name_axes(axes, f"time, s (at {rate:.0f} readings per second); * dirty free record", "")
@@ -304,49 +215,38 @@ def _draw_rows(axes: Axes, result: _ContactResult) -> None:
         axes.text(across, 1.02, f"■ {name}", color=colour, fontsize=9, transform=axes.transAxes)
 
 
-def _draw_release(axes: Axes, result: _ContactResult) -> None:
-    """The channel of the strongest signal of the first whisker that is let go, around that time."""
-    whisker = int(np.argmax(~result.never & ~result.contact[-1]))
-    end = true_runs(result.contact[:, whisker])[0][1]
+def _draw_signals(let_go: Axes, drifting: Axes, result: _ContactResult) -> None:
+    """Departures from the free mean: of the strongest channel of the first whisker that is let go, around
+    that time, and of the channel that drifts most among whiskers that never touch, with its baseline."""
+    signal, free, rate = result.record.signal, result.free, result.config.rate
+    scaled, base = ((part - free.mean) / free.noise for part in (signal, result.baseline))
+    first = int(np.argmax(~result.never & ~result.contact[-1]))
+    end = true_runs(result.contact[:, first])[0][1]
     rows = np.arange(end - 25, end + 55)
-    channel = int(
-        np.argmax(np.abs(result.record.signal[:end, whisker] - result.free.mean[whisker]).max(axis=0))
-    )
-    noise = result.free.noise[whisker, channel]
-    departure = (result.record.signal[rows, whisker, channel] - result.free.mean[whisker, channel]) / noise
-    time = rows / result.config.rate
-    axes.axvspan(time[0], end / result.config.rate, color=style.BLUE, alpha=0.15, lw=0)
+    strongest = int(np.argmax(np.abs(signal[:end, first] - free.mean[first]).max(axis=0)))
+    departure, time = scaled[rows, first, strongest], rows / rate
     beyond = np.abs(departure) > 20
-    axes.plot(time, departure, color=style.GREY, lw=0.8)
-    axes.plot(time[beyond], departure[beyond], ".", color=style.VERMILLION, ms=3)
-    axes.plot(time[~beyond], departure[~beyond], ".", color=style.INK, ms=3)
-    axes.set(xlim=(time[0], time[-1]), ylim=(-60, 120))
-    name = f"{result.whiskers[whisker]}, {'xyz'[channel]}: let go, it rings"
-    axes.set_title(name, loc="left", fontsize=10, color=style.INK)
-    style.name_axes(axes, "time, s", "departure, sd of the noise")
-
-
-def _draw_drift(axes: Axes, result: _ContactResult) -> None:
-    """The channel that drifts most among the whiskers that never touch, and its tracked baseline."""
-    scaled = (result.record.signal - result.free.mean) / result.free.noise
-    base = (result.baseline - result.free.mean) / result.free.noise
+    let_go.axvspan(time[0], end / rate, color=style.BLUE, alpha=0.15, lw=0)
+    let_go.plot(time, departure, color=style.GREY, lw=0.8)
+    let_go.plot(time[beyond], departure[beyond], ".", color=style.VERMILLION, ms=3)
+    let_go.plot(time[~beyond], departure[~beyond], ".", color=style.INK, ms=3)
+    let_go.set(xlim=(time[0], time[-1]), ylim=(-60, 120))
     reach = np.where(result.never[:, None], np.abs(base).max(axis=0), 0.0)
     whisker, channel = np.unravel_index(int(np.argmax(reach)), reach.shape)
-    time = np.arange(len(scaled)) / result.config.rate
-    axes.plot(time, scaled[:, whisker, channel], color=style.GREY, lw=0.4)
-    axes.plot(time, base[:, whisker, channel], color=style.BLUE, lw=1.2)
-    axes.set(xlim=(0, time[-1]))
-    title = f"{result.whiskers[whisker]}, {'xyz'[channel]}: free, it drifts"
-    axes.set_title(title, loc="left", fontsize=10, color=style.INK)
-    style.name_axes(axes, "time, s", "departure, sd of the noise")
+    time = np.arange(len(scaled)) / rate
+    drifting.plot(time, scaled[:, whisker, channel], color=style.GREY, lw=0.4)
+    drifting.plot(time, base[:, whisker, channel], color=style.BLUE, lw=1.2)
+    drifting.set(xlim=(0, time[-1]))
+    for axes, name, at, what in (
+        (let_go, WHISKERS[first], strongest, "let go, it rings"),
+        (drifting, WHISKERS[whisker], channel, "free, it drifts"),
+    ):
+        axes.set_title(f"{name}, {'xyz'[at]}: {what}", loc="left", fontsize=10, color=style.INK)
+        style.name_axes(axes, "time, s", "departure, sd of the noise")
 
 
 def _measure_contacts(data: Path) -> _ContactResult:
-    """Contacts of the record, by the tracked baseline and by the 20-sd rule.
-
-    Raises:
-        InputError: the record or an annotation is missing or damaged.
-    """
+    """Contacts of the record, by the tracked baseline and by the 20-sd rule."""
     config = ReachConfig(file=require_recordings(data, REACH)[0])
     record = read_reach(config.file)
     signal, first = record.signal, record.signal[: config.free_rows]
@@ -357,9 +257,8 @@ def _measure_contacts(data: Path) -> _ContactResult:
     away = np.abs(signal - free.mean).max(axis=0) / free.noise
     never = (away < CONTACT_SDS).all(axis=1)
     contact = touch == Touch.CONTACT
-    marks = read_annotators(FOLDER, WHISKERS, len(signal))
+    tripled = {name: _score_tripled(config, free, signal, contact, name) for name in RULES}
     return _ContactResult(
-        whiskers=WHISKERS,
         config=config,
         record=record,
         free=free,
@@ -369,9 +268,11 @@ def _measure_contacts(data: Path) -> _ContactResult:
         fixed=fixed,
         baseline=baseline,
         never=never,
-        tripled={name: _score_tripled(config, free, signal, contact, name) for name in RULES},
-        hours=_score_hours(config, free, signal, never, dirty),
-        marks=_score_marks(marks, {"tracked": contact, "20 sd": fixed}, ~never & ~dirty),
+        streams={
+            "the record, each baseline times 3": tripled,
+            **_score_hours(config, free, signal, never, dirty),
+        },
+        marks=_mark_lines(dict(zip(RULES, (contact, fixed), strict=True)), ~never & ~dirty),
     )
 
 
@@ -402,8 +303,8 @@ def _decide(config: ReachConfig, free: FreeBaseline, name: str) -> Decide:
 
 def _score_tripled(
     config: ReachConfig, free: FreeBaseline, signal: np.ndarray, contact: np.ndarray, name: str
-) -> StreamScore:
-    """Contacts of the record with each whisker's baseline times 3, against those of the record as it is."""
+) -> np.ndarray:
+    """Scores the contacts of the record with each whisker's baseline times 3 against those of the record."""
     drift = np.stack([baseline_of(signal[:, w], contact[:, w]) for w in range(signal.shape[1])], axis=1)
     found = _decide(config, free, name)(signal + 2 * (drift - drift[0]))
     contacts = missed = false = wrong = 0
@@ -415,7 +316,7 @@ def _score_tripled(
         near = np.convolve(real, np.ones(2 * SHORTEST + 1), "same") > 0
         false += sum(not near[first:last].any() for first, last in true_runs(seen))
         wrong += int((seen & ~near).sum())
-    return StreamScore(contacts, missed, false, wrong, int((~contact).sum()))
+    return np.array([contacts, missed, false, wrong, (~contact).sum()])
 
 
 def baseline_of(signal: np.ndarray, contact: np.ndarray) -> np.ndarray:
@@ -433,21 +334,21 @@ def baseline_of(signal: np.ndarray, contact: np.ndarray) -> np.ndarray:
 
 def _score_hours(
     config: ReachConfig, free: FreeBaseline, signal: np.ndarray, never: np.ndarray, dirty: np.ndarray
-) -> dict[int, dict[str, StreamScore]]:
+) -> dict[str, dict[str, np.ndarray]]:
     """The rules' scores after each number of `HOURS` of one stream."""
     model = fit_free_model(signal[:, never])
     touching = np.flatnonzero(~never & ~dirty)
     snippets = [snippet for w in touching for snippet in _cut(signal[:, w], free.mean[w], free.noise[w])]
     whiskers = signal.shape[1]
-    known = FreeBaseline(np.zeros(signal.shape[1:]), np.tile(model.noise, (whiskers, 1)), {})
+    known = FreeBaseline(np.zeros(signal.shape[1:]), np.tile(model[0], (whiskers, 1)), {})
     ends = [round(hours * 3600 * config.rate / BLOCK) for hours in HOURS]
     made = simulate_stream(model, snippets, whiskers, ends[-1], BLOCK, seed=1)
     rules = {name: _decide(config, known, name) for name in RULES}
-    scores: dict[int, dict[str, StreamScore]] = {}
-    total = dict.fromkeys(RULES, StreamScore(0, 0, 0, 0, 0))
+    scores: dict[str, dict[str, np.ndarray]] = {}
+    total = dict.fromkeys(RULES, np.zeros(5, int))
     for hours, first, last in zip(HOURS, (0, *ends), ends, strict=False):
         part = score_stream(rules, islice(made, last - first))
-        total = scores[hours] = {name: add_scores(total[name], part[name]) for name in RULES}
+        total = scores[f"{hours} h of the fitted drift"] = {name: total[name] + part[name] for name in RULES}
     return scores
 
 
@@ -461,31 +362,32 @@ def _cut(signal: np.ndarray, mean: np.ndarray, noise: np.ndarray) -> list[Snippe
         if last - first >= SHORTEST and last + SETTLING <= after:
             level = signal[first - 30 : first - 10].mean(axis=0)
             part = signal[first - 15 : last + SETTLING] - level
-            found.append(Snippet(part, 15, 15 + last - first))
+            found.append((part, slice(15, 15 + last - first)))
     return found
 
 
-def _score_marks(
-    marks: dict[str, np.ndarray], contacts: dict[str, np.ndarray], touching: np.ndarray
-) -> _MarkResult | None:
-    """Scores against the marks of two annotators; None unless there are two."""
+def _mark_lines(contacts: dict[str, np.ndarray], touching: np.ndarray) -> list[str]:
+    """Contacts [T, W] of each rule against the rows that two annotators mark alike; unclear is where they
+    differ or either says so. `touching` is [W] bool, the whiskers that touch."""
+    marks = read_annotators(FOLDER, WHISKERS, len(contacts["tracked"]))
     if len(marks) != 2:
-        return None
+        return ["Precision and recall: not annotated."]
     one, other = marks.values()
-    agreed = merge_marks(one, other)
-    return _MarkResult(
-        annotators=tuple(marks),
-        agreement=float((one == other).mean()),
-        unclear=float((agreed == Label.UNCLEAR).mean()),
-        whiskers={
-            name: [score_contacts(contact[:, w], agreed[:, w]) for w in range(contact.shape[1])]
-            for name, contact in contacts.items()
-        },
-        pooled={
-            name: score_contacts(contact[:, touching], agreed[:, touching])
-            for name, contact in contacts.items()
-        },
-    )
+    agreed = np.where(one == other, one, UNCLEAR)
+    lines = [
+        f"Annotators {' and '.join(marks)}: agreement {(one == other).mean():.1%} of rows, unclear "
+        f"{(agreed == UNCLEAR).mean():.1%} (goal: at most 15 %).",
+        "",
+        "| whisker | rule | unclear | precision | recall | unclear counted as wrong: precision | recall |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    rows: list[tuple[str, str, Any]] = [("**those that touch**", rule, touching) for rule in contacts]
+    rows += [(name, rule, w) for rule in contacts for w, name in enumerate(WHISKERS)]
+    for name, rule, which in rows:
+        *figures, unclear = score_contacts(contacts[rule][:, which], agreed[:, which])
+        shown = ("-" if np.isnan(figure) else f"{figure:.3f}" for figure in figures)
+        lines.append(markdown_row([name, rule, f"{unclear:.1%}", *shown]))
+    return lines
 
 
 FIGURE = Figure(

@@ -17,10 +17,9 @@ from evaluation.metrics.trajectory import align, ate
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.buildings import buildings_rows
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.tables.recordings import metres
+from evaluation.papers.tables.recordings import metres, require_recordings
 from evaluation.papers.trial_sessions import RecordingRun, closure_claims, run_recording
-from evaluation.papers.whiskers.bumps import WallDistances, wall_distances
-from evaluation.papers.whiskers.recordings import require_recordings
+from evaluation.papers.whiskers.bumps import wall_distances
 from evaluation.plots.style import BLUE, GREY, INK, VERMILLION, add_axes, name_axes, new_figure
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
@@ -67,20 +66,6 @@ class Variant(NamedTuple):
     candidates: int
     right: int
     revisits: float
-
-
-def _run_variants(folder: Path) -> Iterator[tuple[str, RecordingRun]]:
-    """A session by the classic method, and those by keyframes: with half, once and twice the cell size and
-    sector width of the configuration.
-
-    Args:
-        folder: of the repository, which holds `configs`.
-    """
-    rows = {name: row for name, row in buildings_rows().items() if row.section == "create"}
-    default = rows[DEFAULT].recording
-    yield "classic", run_recording(default.configuration(folder, "backend=classic"))
-    for name, row in rows.items():
-        yield name, run_recording(row.configuration(folder))
 
 
 def _measure_variant(run: RecordingRun) -> Variant:
@@ -147,7 +132,7 @@ class CreateResult(NamedTuple):
     Attributes:
         variants: by name. true_turns: ATE of odometry with true turns, m. drift: range of
             odometry's heading error, rad. latency: median age of a depth reading, s. paths: [T, 3] poses
-            aligned with the truth, by name. walls: [W, 4] ends, m. distances: to the nearest wall.
+            aligned with the truth, by name. walls: [W, 4] ends, m. distances: of `wall_distances`.
     """
 
     variants: dict[str, Variant]
@@ -156,23 +141,23 @@ class CreateResult(NamedTuple):
     latency: float
     paths: dict[str, np.ndarray]
     walls: np.ndarray
-    distances: WallDistances
+    distances: tuple[np.ndarray, np.ndarray]
 
 
 def _measure_create(folder: Path) -> CreateResult:
-    """Runs all sessions; in the folder of the repository, which holds `configs`.
-
-    Raises:
-        InputError: a recording is missing.
-    """
+    """Runs all sessions; in the folder of the repository, which holds `configs`."""
     seen, bumps, walls, depth = (
         np.genfromtxt(path, delimiter=",", names=True) for path in require_recordings(folder, *FILES)
     )
     segments = np.stack([walls[name] for name in ("x1", "y1", "x2", "y2")], axis=1)
     pressed = np.any([bumps[name] > 0 for name in BUMPERS], axis=0)
     distances = wall_distances(np.stack([seen["x"], seen["y"]], axis=1), pressed, segments)
+    # By the classic method, and by keyframes: with half, once and twice the cell size and sector width.
+    rows = {name: row for name, row in buildings_rows().items() if row.section == "create"}
+    configs = {"classic": rows[DEFAULT].recording.configuration("backend=classic")}
     variants = {}
-    for name, run in _run_variants(Path()):
+    for name, config in (configs | {name: row.configuration() for name, row in rows.items()}).items():
+        run = run_recording(config)
         variants[name] = _measure_variant(run)
         if name == DEFAULT:
             default = run
@@ -195,18 +180,29 @@ def _measure_create(folder: Path) -> CreateResult:
 
 def _table_create(result: CreateResult) -> list[str]:
     """The lines of the tables."""
-    lines = [markdown_header(COLUMNS)]
-    odometry = next(iter(result.variants.values())).odometry
-    lines.append(markdown_row(["odometry (control)", metres(odometry), metres(odometry), *["-"] * 6]))
+    odometry = metres(next(iter(result.variants.values())).odometry)
+    lines = [markdown_header(COLUMNS), markdown_row(["odometry (control)", odometry, odometry, *["-"] * 6])]
     for name, variant in result.variants.items():
         label = f"{name} (control)"
         if name.startswith("create "):
             _, cell, sector = name.split()
             label = f"recall, cell x {cell}, sector x {sector}" + " (defaults)" * (name == DEFAULT)
-        lines.append(markdown_row([label, *_cells(variant)]))
+        cells = [metres(value) for value in (variant.final, variant.live, variant.map)]
+        if np.isnan(variant.revisits):
+            cells += ["-"] * 5
+        else:
+            share = f"{variant.candidates}, {variant.right / max(variant.candidates, 1):.0%}"
+            cells += [f"{variant.doubt:.2f}", f"{variant.accepted}", f"{variant.false}", share]
+            cells.append(metres(variant.revisits))
+        lines.append(markdown_row([label, *cells]))
     lines.append(markdown_row(["odometry, true turns (bound)", metres(result.true_turns), *["-"] * 7]))
+    walls = [markdown_header(("robot to the nearest wall, m", "number", *(f"{p} %" for p in PERCENTILES)))]
+    names = "at the first reading of a contact", "at all readings (control)"
+    for name, values in zip(names, result.distances, strict=True):
+        spread = np.percentile(values, PERCENTILES)
+        walls.append(markdown_row([name, len(values), *(f"{value:.3f}" for value in spread)]))
     caveats = CAVEATS.format(drift=result.drift, latency=result.latency)
-    return [*lines, "", _summary(result), "", *_wall_table(result.distances), "", caveats]
+    return [*lines, "", _summary(result), "", *walls, "", caveats]
 
 
 CAVEATS = (
@@ -215,17 +211,6 @@ CAVEATS = (
     "{drift:.1f} rad over the session. A depth reading is {latency:.2f} s older than its time (median of the "
     "file's column)."
 )
-
-
-def _cells(variant: Variant) -> list[str]:
-    paths = [metres(value) for value in (variant.final, variant.live, variant.map)]
-    if np.isnan(variant.revisits):
-        return [*paths, *["-"] * 5]
-    share = f"{variant.candidates}, {variant.right / max(variant.candidates, 1):.0%}"
-    return [
-        *paths, f"{variant.doubt:.2f}", str(variant.accepted), str(variant.false), share,
-        metres(variant.revisits),
-    ]  # fmt: skip
 
 
 def _summary(result: CreateResult) -> str:
@@ -245,17 +230,6 @@ def _summary(result: CreateResult) -> str:
         f"{above[0]} at the end, {above[1]} live. False or not right: more than {FALSE_DISTANCE} m or "
         f"{np.degrees(FALSE_TURN):.0f} degrees from the truth."
     )
-
-
-def _wall_table(distances: WallDistances) -> list[str]:
-    rows = [markdown_header(("robot to the nearest wall, m", "number", *(f"{p} %" for p in PERCENTILES)))]
-    for name, values in (
-        ("at the first reading of a contact", distances.contact),
-        ("at all readings (control)", distances.all),
-    ):
-        spread = np.percentile(values, PERCENTILES)
-        rows.append(markdown_row([name, str(len(values)), *(f"{value:.3f}" for value in spread)]))
-    return rows
 
 
 def _draw_create(result: CreateResult, png: Path) -> None:
@@ -278,9 +252,10 @@ def _draw_create(result: CreateResult, png: Path) -> None:
     name_axes(room, "x (m)", "y (m)")
     below = add_axes(figure, 0.62, 0.55, 7.0, 1.8)
     bins = np.arange(0.1, 0.8, 0.01)
+    contact, every = result.distances
     for values, colour, label in (
-        (result.distances.all, GREY, "all readings"),
-        (result.distances.contact, VERMILLION, "first reading of a contact"),
+        (every, GREY, "all readings"),
+        (contact, VERMILLION, "first reading of a contact"),
     ):
         weights = np.full(len(values), 1 / len(values))
         below.hist(values, bins.tolist(), weights=weights, color=colour, alpha=0.8, label=label)

@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.whiskers.recordings import REACH, require_recordings
+from evaluation.papers.tables.recordings import REACH, require_recordings
 from robot.recordings.real_whiskers import read_columns, read_reach
 from robot.simulation.head.baseline import HALL_BASELINE, Baseline, BaselineConfig
 from tactile.base.random_streams import stream
@@ -76,43 +76,28 @@ class _FreeFigures(NamedTuple):
     range: tuple[float, float]
 
 
-class _CreepFigures(NamedTuple):
-    """Figures of whiskers after their last contact.
-
-    Attributes:
-        share, time: of the creep; time in s. shares: of each whisker with that time. offset: [K, T] distance
-            of each whisker from where it settles, as a share of its mean deflection in contact, from its
-            release on, `RATE` a second.
-    """
-
-    share: float
-    time: float
-    shares: np.ndarray
-    offset: np.ndarray
-
-
-DriftResult = tuple[dict[str, _FreeFigures], dict[str, _CreepFigures]]
+Creep = tuple[float, np.ndarray, np.ndarray]
+"""Of whiskers after their last contact: time of the creep, s; share of each whisker with that time; [K, T]
+distance of each whisker from where it settles, as a share of its mean deflection in contact, from its release
+on, `RATE` a second."""
+DriftResult = tuple[dict[str, _FreeFigures], dict[str, Creep]]
 """Figures of free whiskers and after contacts, by source."""
 
 
 def _measure_drift(folder: Path) -> DriftResult:
-    """The figures of real and simulated whiskers.
-
-    Raises:
-        InputError: a recording is missing or damaged.
-    """
+    """The figures of real and simulated whiskers."""
     reach, camera = require_recordings(folder, REACH, CAMERA)
     signal = read_reach(reach).signal
     free: dict[str, _FreeFigures] = {}
-    creep: dict[str, _CreepFigures] = {}
+    creep: dict[str, Creep] = {}
     for name, (untouched, bending) in (("fitted", FIT), ("checked", CHECK)):
         free[name] = free_figures(signal[:, untouched].reshape(len(signal), -1), RATE)
-        creep[name] = creep_figures(signal[:, bending], None if name == "fitted" else creep["fitted"].time)
+        creep[name] = creep_figures(signal[:, bending], None if name == "fitted" else creep["fitted"][0])
     for name, config in (("simulated", HALL_BASELINE), ("control: white noise", BaselineConfig())):
         noise = simulate_free(config, len(signal))
         free[name] = free_figures(noise.reshape(len(signal), -1), RATE)
         bent = np.repeat(signal[:, FIT[1] + CHECK[1]], COPIES, axis=1)
-        creep[name] = creep_figures(_simulate_bent(config, bent), creep["fitted"].time)
+        creep[name] = creep_figures(_simulate_bent(config, bent), creep["fitted"][0])
     held, _ = read_columns(camera, ("Time", "dx", "dy"))
     held = held[(held[:, 0] > 19) & (held[:, 0] < 23.5)]  # pressed without moving
     free["camera"] = free_figures(held[:, 1:], len(held) / np.ptp(held[:, 0]))
@@ -146,7 +131,7 @@ def free_figures(record: np.ndarray, rate: float) -> _FreeFigures:
     )
 
 
-def creep_figures(signal: np.ndarray, time: float | None) -> _CreepFigures:
+def creep_figures(signal: np.ndarray, time: float | None) -> Creep:
     """The figures of whiskers after their last contact: a fit of creep, level and slope to their free end.
 
     Args:
@@ -160,9 +145,7 @@ def creep_figures(signal: np.ndarray, time: float | None) -> _CreepFigures:
     shares = np.array([fit[0] for fit in fits[best]])
     offset = [fit[2] for fit in fits[best]]
     length = min(map(len, offset))
-    return _CreepFigures(
-        float(np.median(shares)), float(times[best]), shares, np.array([row[:length] for row in offset])
-    )
+    return float(times[best]), shares, np.array([row[:length] for row in offset])
 
 
 def _creep_fit(signal: np.ndarray, touches: np.ndarray, time: float) -> tuple[float, float, np.ndarray]:
@@ -230,8 +213,9 @@ def _table_drift(result: DriftResult) -> list[str]:
         cells += ["white" if free.time is None else f"{1000 * free.time:.1f} ms", f"{free.drift:.2f}"]
         cells.append("{:.1f}-{:.1f}".format(*free.range))
         if creep := result[1].get(name):
-            cells.append(f"{creep.share:.3f} ({creep.shares.min():.3f}-{creep.shares.max():.3f})")
-            cells.append(f"{creep.time:.2f} s")
+            time, shares, _ = creep
+            cells.append(f"{np.median(shares):.3f} ({shares.min():.3f}-{shares.max():.3f})")
+            cells.append(f"{time:.2f} s")
         lines.append(markdown_row([*cells, *["-"] * (len(COLUMNS) - len(cells))]))
     return [*lines, "", CAVEATS]
 
@@ -252,7 +236,7 @@ def _draw_drift(result: DriftResult, png: Path) -> None:
         free = result[0][name]
         colours.plot(1000 * LAGS / RATE, free.correlation, marker=".", **style)
         drift.semilogx(SPANS[: len(free.change)] / RATE, free.change, **style)
-        offset = 100 * np.median(result[1][name].offset, axis=0)
+        offset = 100 * np.median(result[1][name][2], axis=0)
         smooth = np.convolve(offset, np.ones(20) / 20, "valid")
         creep.plot((np.arange(len(smooth)) + 10) / RATE, smooth, **style)
     colours.set(xlabel="lag (ms)", ylabel="autocorrelation", title="Noise of free whiskers")
@@ -273,98 +257,70 @@ Decide = Callable[[np.ndarray], np.ndarray]
 """Contact [T, W] bool of the next samples [T, W, K] of a stream."""
 
 
-class FreeModel(NamedTuple):
-    """The signal of a free channel: a random walk and first-order autoregressive noise.
-
-    Attributes:
-        noise: [K] its standard deviation. correlation: [K] of neighbouring samples of the noise.
-        drift: [K] standard deviation of the walk's step.
-    """
-
-    noise: np.ndarray
-    correlation: np.ndarray
-    drift: np.ndarray
-
-
-class Snippet(NamedTuple):
-    """A contact cut out of a record.
-
-    Attributes:
-        deviation: [S, K] from the baseline, with some samples before and after. first, last: the contact's.
-    """
-
-    deviation: np.ndarray
-    first: int
-    last: int
-
-
+Snippet = tuple[np.ndarray, slice]
+"""A contact cut out of a record: [S, K] samples from the baseline, with some before and after the contact;
+and the samples of the contact."""
 Plant = tuple[slice, slice]
 """The samples of a snippet in a block of a stream, and of its contact."""
 
 
-class StreamScore(NamedTuple):
-    """What a rule made of some hours.
-
-    Attributes:
-        contacts: planted, each longer than 0.1 s. missed: of them with less than half of it found.
-        false: stretches found in contact with no snippet at that time. wrong: their samples.
-        free: samples outside snippets.
-    """
-
-    contacts: int
-    missed: int
-    false: int
-    wrong: int
-    free: int
-
-
-def fit_free_model(record: np.ndarray) -> FreeModel:
-    """The model of free whiskers, each figure the largest of theirs.
+def fit_free_model(record: np.ndarray) -> np.ndarray:
+    """The model of a free channel, a random walk and first-order autoregressive noise: [3, K] standard
+    deviation of the noise, correlation of its neighbouring samples, standard deviation of the walk's step.
 
     Args:
-        record: [T, W, K] of whiskers that touch nothing.
+        record: [T, W, K] of whiskers that touch nothing; each figure is the largest of theirs.
     """
     noise = estimate_noise(record)
     difference = np.median(np.diff(record, axis=0) ** 2, axis=0) / 0.45494 / 2
     correlation = np.clip(1 - difference / noise**2, 0.0, 0.95)
-    return FreeModel(noise.max(axis=0), correlation.max(axis=0), estimate_drift(record).max(axis=0))
+    return np.array([each.max(axis=0) for each in (noise, correlation, estimate_drift(record))])
 
 
 def simulate_stream(
-    model: FreeModel, snippets: Sequence[Snippet], whiskers: int, blocks: int, block: int, seed: int
+    model: np.ndarray, snippets: Sequence[Snippet], whiskers: int, blocks: int, block: int, seed: int
 ) -> Iterator[tuple[np.ndarray, list[Plant]]]:
     """A drifting stream in blocks, in each of which every whisker has one contact of a drawn snippet.
+
+    Args:
+        model: of `fit_free_model`.
 
     Yields:
         [block, W, K] samples, and each whisker's contact.
     """
-    random, shape = stream(seed, "spliced hours"), (block, whiskers, len(model.noise))
+    size, correlations, step = model
+    random, shape = stream(seed, "spliced hours"), (block, whiskers, len(size))
     level, memory = np.zeros(shape[1:]), np.zeros(shape[1:])
-    white = model.noise * np.sqrt(1 - model.correlation**2)
+    white = size * np.sqrt(1 - correlations**2)
     for _ in range(blocks):
-        walk = level + np.cumsum(model.drift * random.standard_normal(shape), axis=0)
+        walk = level + np.cumsum(step * random.standard_normal(shape), axis=0)
         level, noise = walk[-1], np.empty(shape)
         push = white * random.standard_normal(shape)
-        for channel, correlation in enumerate(model.correlation):
+        for channel, correlation in enumerate(correlations):
             start = correlation * memory[None, :, channel]
             noise[..., channel], _ = lfilter([1.0], [1.0, -correlation], push[..., channel], axis=0, zi=start)
         memory = noise[-1]
         planted = []
         for whisker in range(whiskers):
-            snippet = snippets[int(random.integers(len(snippets)))]
-            length = len(snippet.deviation)
-            first = int(random.integers(block - length))
-            noise[first : first + length, whisker] = snippet.deviation
-            contact = slice(first + snippet.first, first + snippet.last)
-            planted.append((slice(first, first + length), contact))
+            deviation, contact = snippets[int(random.integers(len(snippets)))]
+            first = int(random.integers(block - len(deviation)))
+            whole = slice(first, first + len(deviation))
+            noise[whole, whisker] = deviation
+            planted.append((whole, slice(first + contact.start, first + contact.stop)))
         yield walk + noise, planted
 
 
 def score_stream(
     rules: Mapping[str, Decide], blocks: Iterable[tuple[np.ndarray, list[Plant]]]
-) -> dict[str, StreamScore]:
-    """Scores rules by name on the same stream of planted contacts."""
-    scores = dict.fromkeys(rules, StreamScore(0, 0, 0, 0, 0))
+) -> dict[str, np.ndarray]:
+    """Scores rules by name on the same stream of planted contacts.
+
+    Returns:
+        [5] counts of each rule: planted contacts, each longer than 0.1 s; missed of them, with less than half
+        found; stretches found in contact with no snippet at that time; their samples; samples outside
+        snippets. Those of several parts of a stream add up.
+    """
+    scores = dict.fromkeys(rules, np.zeros(5, int))
     for samples, planted in blocks:
         for name, decide in rules.items():
             contact = decide(samples)
@@ -374,11 +330,5 @@ def score_stream(
                 free[snippet, whisker] = False
             wrong = contact & free
             false = np.count_nonzero(np.diff(wrong.astype(np.int8), prepend=0, axis=0) == 1)
-            block = StreamScore(len(planted), missed, int(false), int(wrong.sum()), int(free.sum()))
-            scores[name] = add_scores(scores[name], block)
+            scores[name] = scores[name] + [len(planted), missed, false, wrong.sum(), free.sum()]
     return scores
-
-
-def add_scores(*scores: StreamScore) -> StreamScore:
-    """The score of several parts of a stream together."""
-    return StreamScore(*(sum(column) for column in zip(*scores, strict=True)))

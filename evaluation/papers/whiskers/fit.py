@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from evaluation.metrics.trajectory import ate
 from evaluation.papers.figure import Figure
-from evaluation.papers.whiskers.recordings import REACH, require_recordings
+from evaluation.papers.tables.markdown import markdown_row
+from evaluation.papers.tables.recordings import REACH, require_recordings
 from evaluation.plots import style
 from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
 from ratslam.service.record_fit import RevisitFit, fit_revisits, read_signals_of_reach
 from ratslam.service.rig_fit import WheelFit, fit_wheels
-from robot.sources.in_memory import InMemorySource, load_into_memory, select_rows
+from robot.sources.in_memory import load_into_memory, select_rows
 from robot.sources.odometry import UNCORRECTED, correct_motions
 from tactile.base.plugins import PluginConfig
 from tactile.base.se2 import compose, fit_rigid_motion, integrate
@@ -37,47 +37,21 @@ VALUES = {"length_scale": 1.0, "turn_scale": 1.0, "heading_bias": 0.0}
 """The quantities of the table, and what is assumed."""
 
 
-class _RecordResult(NamedTuple):
-    """The wheels of a record: fitted on all of it and on each half; ATE of dead reckoning of the two halves
-    (m), as recorded and corrected by the other half; from revisits, where the record was mapped."""
-
-    whole: WheelFit
-    halves: tuple[WheelFit, WheelFit]
-    before: tuple[float, float]
-    after: tuple[float, float]
-    revisits: RevisitFit | None
+_Record = tuple[list[WheelFit], list[tuple[np.ndarray, ...]], RevisitFit | None]
+"""The wheels of a record: fitted on all of it and on each half; of each half, its true path and the paths by
+odometry, as recorded and corrected by the fit of the other, [N, 3]; from revisits, where it was mapped."""
+_Rigs = tuple[dict[str, _Record], SignalRecord, SignalFit]
+"""All records, and the whiskers of the arm."""
 
 
-class _FitResult(NamedTuple):
-    """All records, the paths of the Create's halves (truth, as recorded, corrected), the arm's whiskers."""
-
-    records: dict[str, _RecordResult]
-    paths: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]
-    signals: SignalRecord
-    whiskers: SignalFit
-
-
-def _measure(folder: Path) -> _FitResult:
-    """Fits all records below the folder of the real recordings.
-
-    Raises:
-        InputError: a record is missing or damaged.
-    """
+def _measure(folder: Path) -> _Rigs:
+    """Fits all records below the folder of the real recordings."""
     require_recordings(folder, REACH, *(file for _, file in RECORDS.values()))
-    records = dict[str, _RecordResult]()
-    for name in RECORDS:
-        records[name] = _measure_wheels(name, _log(name, folder), folder)
-    create = _pairs(_log(CREATE, folder), records[CREATE])
-    paths = tuple(_paths(half, fit) for half, fit in create)
+    records = {name: _measure_wheels(name, folder) for name in RECORDS}
     signals = read_signals_of_reach(
         PluginConfig(plugin="whisker_reach", settings={"file": str(folder / REACH)})
     )
-    return _FitResult(records, paths, signals, fit_signals(signals))
-
-
-def _log(name: str, folder: Path) -> InMemorySource:
-    with open_source(load_config(RECORDS[name][0], _assignments(name, folder))) as source:
-        return load_into_memory(source)
+    return records, signals, fit_signals(signals)
 
 
 def _assignments(name: str, folder: Path) -> list[str]:
@@ -96,63 +70,45 @@ def _assignments(name: str, folder: Path) -> list[str]:
     return [f"recording.file={folder / file}", *named, *relations]
 
 
-def _measure_wheels(name: str, log: InMemorySource, folder: Path) -> _RecordResult:
+def _measure_wheels(name: str, folder: Path) -> _Record:
+    config = load_config(RECORDS[name][0], _assignments(name, folder))
+    with open_source(config) as source:
+        log = load_into_memory(source)
+    half = log.length // 2
+    halves = [select_rows(log, rows) for rows in (np.arange(half), np.arange(half, log.length))]
     fits = []
-    for part in (log, *_halves(log)):
+    for part in (log, *halves):
         assert part.truth is not None
         fits.append(fit_wheels(part.time, part.motion[:, :3], part.truth))
-    whole, first, second = fits
-    result = _RecordResult(whole, (first, second), (0.0, 0.0), (0.0, 0.0), None)
-    before, after = list[float](), list[float]()  # ATE of dead reckoning, m
-    for half, fit in _pairs(log, result):
-        assert half.truth is not None
-        known = np.isfinite(half.truth).all(axis=1)
-        for found, correction in ((before, UNCORRECTED), (after, fit.correction)):
-            path = integrate(correct_motions(correction, half.motion[:, :3]))
-            found.append(ate(path[known], half.truth[known]))
-    revisits = None
-    if name in MAPPED:
-        revisits = fit_revisits(load_config(RECORDS[name][0], _assignments(name, folder)))
-    return result._replace(before=(before[0], before[1]), after=(after[0], after[1]), revisits=revisits)
+    paths = list[tuple[np.ndarray, ...]]()
+    for part, fit in zip(halves, fits[:0:-1], strict=True):
+        truth = np.asarray(part.truth)
+        known = np.isfinite(truth).all(axis=1)
+        ways = (correct_motions(each, part.motion[:, :3]) for each in (UNCORRECTED, fit.correction))
+        paths.append((truth[known], *(integrate(motion)[known] for motion in ways)))
+    return fits, paths, fit_revisits(config) if name in MAPPED else None
 
 
-def _halves(log: InMemorySource) -> tuple[InMemorySource, InMemorySource]:
-    half = log.length // 2
-    return select_rows(log, np.arange(half)), select_rows(log, np.arange(half, log.length))
+def _errors(records: dict[str, _Record]) -> np.ndarray:
+    """[N, 2, 2] ATE of dead reckoning of N records, their halves, as recorded and corrected, m."""
+    every = [paths for _, paths, _ in records.values()]
+    return np.array([[[ate(path, true) for path in found] for true, *found in paths] for paths in every])
 
 
-def _pairs(log: InMemorySource, result: _RecordResult) -> list[tuple[InMemorySource, WheelFit]]:
-    """Each half with the fit of the other."""
-    return list(zip(_halves(log), result.halves[::-1], strict=True))
-
-
-def _paths(log: InMemorySource, fit: WheelFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """True path and the paths by odometry, as recorded and corrected, aligned with it, [N, 3] each."""
-    assert log.truth is not None
-    known = np.isfinite(log.truth).all(axis=1)
-    truth = log.truth[known]
-    paths = [
-        integrate(correct_motions(correction, log.motion[:, :3]))[known]
-        for correction in (UNCORRECTED, fit.correction)
-    ]
-    plain, corrected = (compose(fit_rigid_motion(path, truth), path) for path in paths)
-    return truth, plain, corrected
-
-
-def _table(result: _FitResult) -> list[str]:
+def _table(result: _Rigs) -> list[str]:
     """The wheels by record and half, dead reckoning before and after, and the whiskers of the arm."""
+    records, signals, whiskers = result
     lines = [
         "Wheels: each quantity of the whole record, and of its first and second half.",
         "",
         "| record | true over measured distance | true over measured turn | heading bias, rad/m |",
         "|---|---|---|---|",
     ]
-    for name, record in result.records.items():
-        fits = (record.whole, *record.halves)
+    for name, (fits, _, revisits) in records.items():
         cells = ["; ".join(_pair(getattr(fit, key)) for fit in fits) for key in VALUES]
         lines.append(f"| {name} | {' | '.join(cells)} |")
-        if record.revisits is not None:
-            turn, bias = _pair(record.revisits.turn_scale), _pair(record.revisits.heading_bias)
+        if revisits is not None:
+            turn, bias = _pair(revisits.turn_scale), _pair(revisits.heading_bias)
             lines.append(f"| {name}, from revisits alone | not told by revisits | {turn} | {bias} |")
     lines += [
         "",
@@ -161,15 +117,13 @@ def _table(result: _FitResult) -> list[str]:
         "| record | first half | corrected by the second | second half | corrected by the first |",
         "|---|---|---|---|---|",
     ]
-    for name, record in result.records.items():
-        (a, b), (c, d) = record.before, record.after
-        lines.append(f"| {name} | {a:.2f} | {c:.2f} | {b:.2f} | {d:.2f} |")
-    return [*lines, "", *_whisker_lines(result)]
+    for name, errors in zip(records, _errors(records), strict=True):
+        lines.append(markdown_row([name, *(f"{error:.2f}" for error in errors.flat)]))
+    return [*lines, "", *_whisker_lines(signals, whiskers)]
 
 
-def _whisker_lines(result: _FitResult) -> list[str]:
-    fit, names = result.whiskers, result.signals.names
-    unit = result.signals.unit
+def _whisker_lines(signals: SignalRecord, fit: SignalFit) -> list[str]:
+    unit = signals.unit
     lines = [
         "An arm in clutter: medians over the three channels of each whisker.",
         "",
@@ -177,16 +131,13 @@ def _whisker_lines(result: _FitResult) -> list[str]:
         "| in contact | |",
         "|---|---|---|---|---|---|---|",
     ]
-    reasons = fit.dirty
-    for k, name in enumerate(names):
+    for k, name in enumerate(signals.names):
         noise, white, colour, drift = (
             float(np.median(column[k])) for column in (fit.noise, fit.white, fit.correlation, fit.drift)
         )
-        walk = "unknown" if np.isnan(drift) else f"{drift:.2g}"
-        share = f"{result.signals.contact[k]:.0%}"
-        lines.append(
-            f"| {name} | {noise:.2f} | {white:.2f} | {colour:.2f} | {walk} | {share} | {reasons.get(k, '')} |"
-        )
+        cells = [name, *(f"{value:.2f}" for value in (noise, white, colour))]
+        cells += ["unknown" if np.isnan(drift) else f"{drift:.2g}", f"{signals.contact[k]:.0%}"]
+        lines.append(markdown_row([*cells, fit.dirty.get(k, "")]))
     lines += [
         "",
         "The standard deviations are of one record by blocks of time; they do not contain what differs from "
@@ -205,37 +156,40 @@ def _pair(found: tuple[float, float] | None) -> str:
     return "unknown" if found is None else f"{found[0]:.3f} ± {found[1]:.3f}"
 
 
-def _draw(result: _FitResult, png: Path) -> None:
+def _draw(result: _Rigs, png: Path) -> None:
     """The quantities with their intervals, dead reckoning before and after, two paths, and the whiskers."""
+    records, signals, whiskers = result
     title = "What a record tells of its rig"
     line = "Wheels against truth, half against half; noise of the whiskers of an arm in clutter"
     figure = style.new_figure(9.6, title, line)
     for k, (key, assumed) in enumerate(VALUES.items()):
         _draw_intervals(
-            style.add_axes(figure, 1.25 + 2.25 * k, 6.25, 1.95, 2.15), result, key, assumed, k == 0
+            style.add_axes(figure, 1.25 + 2.25 * k, 6.25, 1.95, 2.15), records, key, assumed, k == 0
         )
-    create = result.records[CREATE]
+    fits, paths, _ = records[CREATE]
     for k, half in enumerate(("first half", "second half")):
-        other = create.halves[1 - k].correction
+        other = fits[2 - k].correction
         label = (
             f"{half}, corrected by the other" if other != UNCORRECTED else f"{half}: the other is not sure"
         )
-        _draw_paths(style.add_axes(figure, 0.62 + 2.45 * k, 3.35, 2.2, 2.2), result.paths[k], label)
-    _draw_ate(style.add_axes(figure, 5.75, 3.45, 1.95, 2.05), result)
-    _draw_whiskers(style.add_axes(figure, 0.75, 0.7, 6.9, 1.6), result)
+        _draw_paths(style.add_axes(figure, 0.62 + 2.45 * k, 3.35, 2.2, 2.2), paths[k], label)
+    _draw_ate(style.add_axes(figure, 5.75, 3.45, 1.95, 2.05), records)
+    _draw_whiskers(style.add_axes(figure, 0.75, 0.7, 6.9, 1.6), signals, whiskers)
     figure.savefig(png)
 
 
-def _draw_intervals(axes: style.Axes, result: _FitResult, key: str, assumed: float, named: bool) -> None:
+def _draw_intervals(
+    axes: style.Axes, records: dict[str, _Record], key: str, assumed: float, named: bool
+) -> None:
     axes.axvline(assumed, color=style.GREY, lw=1)
     colours = (style.INK, style.BLUE, style.VERMILLION)
-    for row, record in enumerate(result.records.values()):
-        for part, (fit, colour) in enumerate(zip((record.whole, *record.halves), colours, strict=True)):
+    for row, (fits, *_) in enumerate(records.values()):
+        for part, (fit, colour) in enumerate(zip(fits, colours, strict=True)):
             value, sd = getattr(fit, key) or (np.nan, 0.0)
             at = -row - 0.22 * (part - 1)
             axes.errorbar(value, at, xerr=2 * sd, fmt="o", ms=3, lw=1.2, color=colour)
-    ticks = [-row for row in range(len(result.records))]
-    axes.set_yticks(ticks, list(result.records) if named else [""] * len(ticks))
+    ticks = [-row for row in range(len(records))]
+    axes.set_yticks(ticks, list(records) if named else [""] * len(ticks))
     axes.set_xlabel(
         {"length_scale": "distance, true / measured", "turn_scale": "turn, true / measured"}.get(
             key, "heading bias, rad/m"
@@ -259,7 +213,9 @@ def _draw_paths(axes: style.Axes, paths: tuple[np.ndarray, ...], label: str) -> 
         ("as recorded", style.VERMILLION, 1.0),
         ("corrected", style.BLUE, 1.0),
     )
-    for path, (word, colour, width) in zip(paths, words, strict=True):
+    truth, *found = paths
+    aligned = truth, *(compose(fit_rigid_motion(path, truth), path) for path in found)
+    for path, (word, colour, width) in zip(aligned, words, strict=True):
         axes.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=word)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_title(label, fontsize=9, color=style.INK, loc="left")
@@ -270,40 +226,37 @@ def _draw_paths(axes: style.Axes, paths: tuple[np.ndarray, ...], label: str) -> 
     )  # fmt: skip
 
 
-def _draw_ate(axes: style.Axes, result: _FitResult) -> None:
+def _draw_ate(axes: style.Axes, records: dict[str, _Record]) -> None:
     """Dead reckoning of both halves, before against after."""
-    before = np.array([record.before for record in result.records.values()])
-    after = np.array([record.after for record in result.records.values()])
+    before, after = np.moveaxis(_errors(records), -1, 0)
     style.log_axes(axes, np.concatenate([before, after]), np.concatenate([before, after]))
     low, high = axes.get_xlim()
     axes.plot([low, high], [low, high], color=style.GREY, lw=1)
-    for k, name in enumerate(result.records):
+    for k, name in enumerate(records):
         colour = style.VERMILLION if name == CREATE else style.BLUE
         axes.plot(before[k], after[k], "o", ms=4.5, color=colour, alpha=0.85)
     axes.set_title("dead reckoning, Create in red", fontsize=9, color=style.INK, loc="left")
     style.name_axes(axes, "ATE as recorded, m", "ATE corrected, m")
 
 
-def _draw_whiskers(axes: style.Axes, result: _FitResult) -> None:
-    fit, names = result.whiskers, result.signals.names
-    dirty = fit.dirty
-    at = np.arange(len(names))
+def _draw_whiskers(axes: style.Axes, signals: SignalRecord, fit: SignalFit) -> None:
+    at = np.arange(len(signals.names))
     for channel, shift in enumerate((-0.25, 0.0, 0.25)):
         label = "noise" if channel == 0 else None
         axes.bar(at + shift, fit.noise[:, channel], 0.22, color=style.BLUE, alpha=0.45, label=label)
         white = "white part" if channel == 0 else None
         axes.bar(at + shift, fit.white[:, channel], 0.22, color=style.BLUE, label=white)
-    for k in dirty:
+    for k in fit.dirty:
         axes.annotate(
             "dirty free record", (k + 0.4, 1.12 * fit.noise.max()), ha="right", fontsize=8.5,
             color=style.VERMILLION,
         )  # fmt: skip
-    axes.set_xticks(at, names, rotation=30)
+    axes.set_xticks(at, signals.names, rotation=30)
     axes.set_ylim(0, 1.25 * fit.noise.max())
     axes.set_title(
         "whiskers on an arm: standard deviation of x, y, z, free", fontsize=9, color=style.INK, loc="left"
     )
-    axes.set_ylabel(result.signals.unit, color=style.LABEL_GREY, fontsize=9)
+    axes.set_ylabel(signals.unit, color=style.LABEL_GREY, fontsize=9)
     axes.legend(frameon=False, fontsize=8.5, loc="upper left", ncols=2)
 
 

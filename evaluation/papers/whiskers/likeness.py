@@ -17,7 +17,7 @@ from scipy.special import expit, logit
 
 from evaluation.metrics.statistics import auc, expected_calibration_error
 from evaluation.papers.figure import Figure
-from evaluation.papers.whiskers.recordings import require_recordings
+from evaluation.papers.tables.recordings import require_recordings
 from ratslam.recall.signed_likelihood import ImagePairs, learn, log_odds, project, stored_image
 from robot.recordings.real_whiskers import read_contacts, read_object
 from tactile.base.random_streams import stream
@@ -31,19 +31,6 @@ DEVELOPED = (0, 1, 2)
 PAIRS = 4000
 """Largest number of pairs of one object that are learned from."""
 BINS = 10
-
-
-class _ImageSet(NamedTuple):
-    """N recorded images of objects.
-
-    Attributes:
-        views: [N, D] as recorded. thing: [N] number of the object. run: [N] number of the run or contact:
-            images of a run are held out together, and pairs to learn from are of different runs.
-    """
-
-    views: np.ndarray
-    thing: np.ndarray
-    run: np.ndarray
 
 
 class _HeldOut(NamedTuple):
@@ -74,51 +61,50 @@ _Likeness = tuple[list[_HeldOut], list[_HeldOut]]
 
 
 def _measure(folder: Path) -> _Likeness:
-    """Compares all held-out images.
-
-    Raises:
-        InputError: a recording is missing or damaged.
-    """
+    """Compares all held-out images."""
     objects, taxels = require_recordings(folder, OBJECTS, TAXELS)
     # The touches of all objects, in runs of 30; and an image of each contact, its mean pressures.
     views = [read_object(path)[0].reshape(-1, 128) for path in sorted(objects.glob("*.csv"))]
     count = [len(rows) for rows in views]
     run = np.concatenate([np.arange(rows) // BLOCK for rows in count])
-    whiskers = _ImageSet(np.concatenate(views), np.repeat(np.arange(len(views)), count), run)
+    whiskers = np.concatenate(views), np.repeat(np.arange(len(views)), count), run
     felt = read_contacts(taxels)
     pressures = np.stack([contact.pressure.mean(axis=0).reshape(-1) for contact in felt])
-    contacts = _ImageSet(pressures, np.array([contact.object for contact in felt]), np.arange(len(felt)))
+    contact = np.arange(len(felt))
+    contacts = pressures, np.array([contact.object for contact in felt]), contact
     return (
-        [_hold_out(whiskers, whiskers.run == block) for block in np.unique(whiskers.run)],
-        [_hold_out(contacts, np.arange(len(contacts.run)) == k) for k in range(len(contacts.run))],
+        [_hold_out(*whiskers, run == block) for block in np.unique(run)],
+        [_hold_out(*contacts, contact == k) for k in contact],
     )
 
 
-def _hold_out(images: _ImageSet, held: np.ndarray) -> _HeldOut:
-    """Learns from the images that are not held out (`held` [N] bool) and compares the others with them."""
-    rest = _ImageSet(*(column[~held] for column in images))
-    alive = np.ones(images.views.shape[1], bool)
-    stored = stored_image(rest.views, alive)
+def _hold_out(views: np.ndarray, thing: np.ndarray, run: np.ndarray, held: np.ndarray) -> _HeldOut:
+    """Learns from the images that are not held out and compares the others with them.
+
+    Args:
+        views: [N, D] images as recorded. thing: [N] number of the object of each. run: [N] number of the run
+            or contact: pairs to learn from are of different ones. held: [N] bool.
+    """
+    old, others, run = views[~held], thing[~held], run[~held]
+    seen, felt, alive = views[held], thing[held], np.ones(views.shape[1], bool)
+    stored = stored_image(old, alive)
     # Numbers of images: pairs of one object in different runs, [P] and [P], and pairs of two, [Q, 2].
-    a, b = stream(0, "training pairs").integers(len(rest.run), size=(2, 50 * PAIRS))
-    alike = rest.thing[a] == rest.thing[b]
-    one = np.flatnonzero(alike & (rest.run[a] != rest.run[b]))[:PAIRS]
+    a, b = stream(0, "training pairs").integers(len(run), size=(2, 50 * PAIRS))
+    alike = others[a] == others[b]
+    one = np.flatnonzero(alike & (run[a] != run[b]))[:PAIRS]
     two = np.flatnonzero(~alike)[: 5 * PAIRS]
     pairs, apart = ImagePairs(stored[a[one]], stored[b[one]]), np.column_stack([a[two], b[two]])
     model = learn(stored, pairs, apart)
     known = project(model, stored.T)
-    found = project(model, stored_image(images.views[held], alive).T)
+    found = project(model, stored_image(seen, alive).T)
     odds = np.stack([log_odds(model, image[:, None], known) for image in found.T])
-    thing = images.thing[held]
-    recognised = {"log-odds": float((rest.thing[odds.argmax(axis=1)] == thing).mean())}
+    recognised = {"log-odds": float((others[odds.argmax(axis=1)] == felt).mean())}
     distances = []  # [H, M] sums of the absolute differences, to a power, of the images or of their roots
     for name, (order, roots) in DISTANCES.items():
-        seen, old = images.views[held], rest.views
-        if roots:
-            seen, old = (np.sign(views) * np.sqrt(np.abs(views)) for views in (seen, old))
-        distances.append(np.stack([(np.abs(old - view) ** order).sum(axis=1) for view in seen]))
-        recognised[name] = float((rest.thing[distances[-1].argmin(axis=1)] == thing).mean())
-    return _HeldOut(odds, thing[:, None] == rest.thing, recognised, distances[0])
+        one, two = (np.sign(part) * np.sqrt(np.abs(part)) if roots else part for part in (seen, old))
+        distances.append(np.stack([(np.abs(two - view) ** order).sum(axis=1) for view in one]))
+        recognised[name] = float((others[distances[-1].argmin(axis=1)] == felt).mean())
+    return _HeldOut(odds, felt[:, None] == others, recognised, distances[0])
 
 
 def _probabilities(odds: np.ndarray, same: np.ndarray) -> np.ndarray:

@@ -19,9 +19,9 @@ import numpy as np
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import align
 from evaluation.papers.figure import Figure
+from evaluation.papers.tables.recordings import require_recordings
 from evaluation.papers.trial_sessions import collect_session, run_session
 from evaluation.papers.whiskers.likeness import OBJECTS
-from evaluation.papers.whiskers.recordings import require_recordings
 from evaluation.papers.whiskers.walk_source import (
     WalkConfig,
     most_needed,
@@ -73,11 +73,7 @@ class _WalkResult(NamedTuple):
 
 
 def _measure(folder: Path) -> list[_WalkResult]:
-    """Five walks.
-
-    Raises:
-        InputError: a recording is missing or damaged.
-    """
+    """Five walks."""
     (objects,) = require_recordings(folder, OBJECTS)
     # The first mazes in which no object is needed more often than half of its rows.
     mazes: list[int] = []
@@ -94,26 +90,20 @@ def _measure(folder: Path) -> list[_WalkResult]:
         for maze in mazes
     ]
     logs = [open_walk(walk) for walk in walks]
-    given = RunConfig.model_validate({"source": {"plugin": "whisker_walk"}})
-    recorded = [run_session(complete(given, log), log) for log in logs]
-    sessions = [collect_session(whisker_config(maze)) for maze in mazes]
+    source = RunConfig.model_validate({"source": {"plugin": "whisker_walk"}})
+    recorded = [run_session(complete(source, log), log) for log in logs]
+    given = [{"simulation": walk_simulation(maze).model_dump(exclude_unset=True)} for maze in mazes]
+    sessions = [collect_session(RunConfig.model_validate(parts)) for parts in given]
     simulated = [run_session(*session) for session in sessions]
-    one_way = [run_session(compare_one_way(config), log) for config, log in sessions]
+    # Views are compared only as seen in the same direction.
+    one_way = []
+    for config, log in sessions:
+        recall = config.recall.model_copy(update={"shifts": 0})
+        one_way.append(run_session(config.model_copy(update={"recall": recall}), log))
     real, shuffled = recorded[: len(mazes)], recorded[len(mazes) :]
     ends = [_continue_walk(*row) for row in zip(mazes, real, logs[: len(mazes)], strict=True)]
     rows = zip(mazes, real, shuffled, simulated, one_way, strict=True)
     return [_WalkResult(*row, *end) for row, end in zip(rows, ends, strict=True)]
-
-
-def whisker_config(maze: int) -> RunConfig:
-    """The session in a maze with simulated whiskers."""
-    simulation = walk_simulation(maze).model_dump(exclude_unset=True)
-    return RunConfig.model_validate({"simulation": simulation})
-
-
-def compare_one_way(config: RunConfig) -> RunConfig:
-    """The configuration with views compared only as seen in the same direction."""
-    return config.model_copy(update={"recall": config.recall.model_copy(update={"shifts": 0})})
 
 
 def _continue_walk(

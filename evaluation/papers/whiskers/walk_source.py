@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeInt
@@ -45,15 +44,8 @@ class WalkConfig(Settings):
     """Control: every whisk gives a row of any object."""
 
 
-class Visits(NamedTuple):
-    """What each of N whisks feels.
-
-    Attributes:
-        thing: [N] number of the object. later: [N] bool, the place had been visited before.
-    """
-
-    thing: np.ndarray
-    later: np.ndarray
+Visits = tuple[np.ndarray, np.ndarray]
+"""What each of N whisks feels: [N] number of the object; [N] bool, the place had been visited before."""
 
 
 def open_walk(config: WalkConfig) -> InMemorySource:
@@ -69,9 +61,12 @@ def open_walk(config: WalkConfig) -> InMemorySource:
     objects, digests = zip(*(read_object(path) for path in paths), strict=True)
     session = HeadSimulation(config.simulation)
     visits = plan_visits(session.truth, len(objects), config.seed)
-    draw = draw_any if config.shuffled else draw_by_place
-    images = draw(objects, visits, config.seed)
     count = session.length
+    if config.shuffled:
+        rows = np.concatenate(objects)
+        images = rows[stream(config.seed, "rows of objects").permutation(len(rows))[:count]]
+    else:
+        images = draw_by_place(objects, visits, config.seed)
     settings = config.model_dump_json(exclude={"folder"})
     return InMemorySource(
         name="walk",
@@ -101,14 +96,13 @@ def plan_visits(truth: np.ndarray, things: int, seed: int) -> Visits:
         whisks = np.flatnonzero(place == number)
         away = np.diff(whisks) > AWAY
         later[whisks[1:]] = np.cumsum(away) > 0
-    return Visits(thing, later)
+    return thing, later
 
 
 def most_needed(visits: Visits) -> int:
     """The largest number of rows that an object needs, of first visits or of later ones."""
-    return int(
-        max(np.bincount(visits.thing[visits.later == later]).max(initial=0) for later in (False, True))
-    )
+    thing, again = visits
+    return int(max(np.bincount(thing[again == later]).max(initial=0) for later in (False, True)))
 
 
 def draw_by_place(objects: Sequence[np.ndarray], visits: Visits, seed: int) -> np.ndarray:
@@ -118,25 +112,19 @@ def draw_by_place(objects: Sequence[np.ndarray], visits: Visits, seed: int) -> n
     Raises:
         InputError: there are too few rows.
     """
+    thing, again = visits
     random = stream(seed, "rows of objects")
-    images = np.zeros((len(visits.thing), *objects[0].shape[1:]))
+    images = np.zeros((len(thing), *objects[0].shape[1:]))
     for number, touches in enumerate(objects):
         half = len(touches) // 2
         for later, rows in ((False, np.arange(half)), (True, np.arange(half, 2 * half))):
-            whisks = np.flatnonzero((visits.thing == number) & (visits.later == later))
+            whisks = np.flatnonzero((thing == number) & (again == later))
             if len(whisks) > half:
-                found = (
-                    f"object {number} is felt {len(whisks)} times in {'later' if later else 'first'} visits"
-                )
+                which = "later" if later else "first"
+                found = f"object {number} is felt {len(whisks)} times in {which} visits"
                 raise InputError("seed", found, f"at most {half} times", "choose another seed")
             images[whisks] = touches[random.permutation(rows)[: len(whisks)]]
     return images
-
-
-def draw_any(objects: Sequence[np.ndarray], visits: Visits, seed: int) -> np.ndarray:
-    """[N, 8, 16] rows of any object; the control."""
-    rows = np.concatenate(objects)
-    return rows[stream(seed, "rows of objects").permutation(len(rows))[: len(visits.thing)]]
 
 
 def walk_simulation(maze: int) -> SimulationConfig:

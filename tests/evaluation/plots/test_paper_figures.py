@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from evaluation.papers.salman2016.paper_figures import (
-    ExperienceHistory,
     draw_curves,
     draw_directions,
     draw_drift,
@@ -19,14 +19,10 @@ from evaluation.papers.salman2016.paper_figures import (
 
 RANDOM = np.random.default_rng(0)
 WAY = np.cumsum(RANDOM.normal(size=(40, 2)), axis=0)
-NONE = np.zeros(6, bool)
-HISTORY = ExperienceHistory(
-    place=np.array([0, 1, 0, 2, 1, -1]),
-    counted=np.array([0, 0, 1, 0, 1, 0], bool),
-    right=np.array([0, 0, 1, 0, 0, 0], bool),
-    invalid=NONE,
-    base=2,
+METRIC = SimpleNamespace(
+    counted=np.array([0, 0, 1, 0, 1, 0], bool), right=np.array([0, 0, 1, 0, 0, 0], bool), base=2
 )
+HISTORY = np.array([0, 1, 0, 2, 1, 3, -1]), METRIC
 EDGE = np.linspace(0, 1, 11)
 
 
@@ -96,6 +92,7 @@ def test_every_step_of_a_history_is_drawn_once():
     assert marks["correct re-localisation"] == [2]
     assert marks["incorrect re-localisation"] == [4]
     assert marks["valid experience"] == [0, 1, 3]
+    assert marks["invalid experience"] == [5]  # made after the incorrect re-localisation
     assert marks["end of the base set"][0] == 1.5
 
 

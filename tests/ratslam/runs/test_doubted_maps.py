@@ -11,7 +11,7 @@ from evaluation.artifacts.run_reader import read_run
 from evaluation.metrics import run_metrics
 from evaluation.metrics.scorecard import render_health, render_warnings, score_run
 from evaluation.metrics.trajectory import ate
-from evaluation.papers.tables.spoilt_maps import Recipe, solved_anew, spoil
+from evaluation.papers.tables.spoilt_maps import solved_anew, spoil
 from ratslam.core.backend import NO_CLOSURE
 from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.map_solution import DOUBTED, worse_than_odometry
@@ -30,8 +30,7 @@ def test_a_clean_map_is_its_own_best_estimate():
 def test_a_map_with_false_loops_only_is_doubted():
     log, map = golden(NAME), golden_map(NAME)
     graph, final, truth = map.keyframes(), map.solution(), log.truth[map.keyframe_steps()]
-    recipe = Recipe("only false", kept=0.0, false=True, robust=False)
-    false = spoil(graph, final.log, truth, recipe, np.random.default_rng(0))
+    false = spoil(graph, final.log, truth, np.random.default_rng(0), kept=0.0, choices=300)
     assert worse_than_odometry(graph, solved_anew(graph, false, final, robust=False)) > DOUBTED
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tactile.base.random_streams import stream
-from tactile.base.samples import longest_run, robust_sd, true_runs
+from tactile.base.samples import robust_sd, true_runs
 
 
 def test_outliers_change_the_robust_spread_little() -> None:
@@ -20,6 +20,3 @@ def test_runs_are_half_open_and_reach_both_ends() -> None:
     which = np.array([1, 1, 0, 1, 0, 0, 1, 1], bool)
     assert true_runs(which).tolist() == [[0, 2], [3, 4], [6, 8]]
     assert true_runs(which[:0]).tolist() == true_runs(~which[:2]).tolist() == []
-    assert longest_run(which) == slice(0, 2)
-    assert longest_run(which[1:]) == slice(5, 7)
-    assert longest_run(~which[:2]) == slice(0, 0)

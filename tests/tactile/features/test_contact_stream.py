@@ -122,14 +122,6 @@ def test_a_bent_whisker_that_returns_is_free() -> None:
     assert (touch[1240:] == Touch.FREE).all()
 
 
-def test_a_whisker_pressed_while_the_arm_rests_is_not_bent() -> None:
-    samples = noise(0, 1600)
-    press(samples, 200, 10_000, 80)
-    state, touch = find_contacts(*begin(bent_time=2.0), samples, moving=np.zeros(1600, bool))
-    assert (touch[215:, 0] == Touch.CONTACT).all()
-    assert not state.bent.any()
-
-
 def test_contacts_are_dated_back_to_their_first_row() -> None:
     samples = np.repeat(FREE.mean[None], 300, axis=0)
     samples[100:200, 0, 0] += 50 * FREE.noise[0, 0]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.calibration import DirtyRecordConfig, calibrate_free, clean_stretch
+from tactile.calibration import DirtyRecordConfig, calibrate_free
 
 REPAIR = DirtyRecordConfig(on_dirty="repair")
 
@@ -59,15 +59,6 @@ def test_a_whisker_that_never_rests_is_not_repaired() -> None:
     record[:, 1] += 300 * np.sin(np.arange(400) / 7)[:, None]
     with pytest.raises(InputError, match=r"whisker 1: its noise .* no clean stretch"):
         calibrate_free(REPAIR, record)
-
-
-def test_the_clean_stretch_leaves_the_contact_out() -> None:
-    record = free_record(rows=600)
-    press(record, 2, 200, 300)
-    rows = clean_stretch(record[:, 2], np.full(3, 8.0))
-    assert rows is not None
-    assert rows.start >= 285
-    assert clean_stretch(np.cumsum(record[:, 2], axis=0), np.full(3, 8.0)) is None
 
 
 def test_a_whisker_without_a_signal_is_no_standard_for_the_others() -> None:

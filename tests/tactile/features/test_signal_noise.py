@@ -11,12 +11,8 @@ from scipy.signal import lfilter
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.calibration import (
-    LAG,
-    WINDOW,
     estimate_drift,
     estimate_noise,
-    quiet_windows,
-    window_variances,
 )
 
 SEEDS = st.integers(0, 10_000)
@@ -86,14 +82,6 @@ def test_channels_are_independent_and_a_constant_one_has_no_noise() -> None:
     noise = estimate_noise(record)
     assert noise[3] == 0
     np.testing.assert_array_equal(noise[:3], estimate_noise(record[:, :3]))
-
-
-def test_windows_with_a_contact_are_not_quiet() -> None:
-    quiet = quiet_windows(window_variances(coloured(2, 1200) + push(1200, 600, 900, 500.0)))
-    begin = np.arange(len(quiet)) * (WINDOW // 2)
-    rising = (begin > 600 - WINDOW) & (begin + WINDOW + LAG < 700)
-    assert not quiet[rising].any()
-    assert quiet[begin + WINDOW + LAG < 600].mean() > 0.97
 
 
 @settings(max_examples=15)

@@ -23,7 +23,6 @@ from evaluation.papers.fox2012.reproduction import (
     PROTOCOLS,
     RECKONED,
     TRUE,
-    Measure,
     plan_jobs,
     rank_mappers,
     render_rankings,
@@ -46,8 +45,7 @@ from tests.helpers.grid_world import TIPS, create, report
 
 TINY = ("create_simulation.reports=40", "grid.particles=20")
 ROOMY = Arena("roomy", np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (), np.zeros(3))
-BRIER = next(measure for measure in MEASURES if measure.key == "map_brier_skill")
-EVERYWHERE = MEASURES[0]
+BRIER, EVERYWHERE = "map_brier_skill", next(iter(MEASURES))
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +72,10 @@ def result_of(
 
 
 def of(
-    measure: Measure, table: dict[str, list[float]], along: str = FILTERED, best: float = 0.0
+    field: str, table: dict[str, list[float]], along: str = FILTERED, best: float = 0.0
 ) -> list[ResultRow]:
     return [
-        result_of(mapper, k, measure.key, value, along, best)
+        result_of(mapper, k, field, value, along, best)
         for mapper, values in table.items()
         for k, value in enumerate(values)
     ]
@@ -119,11 +117,11 @@ def test_an_intermediate_stop_does_not_change_the_result(tiny: object) -> None:
     out = simulate_session(config.create_simulation)
     reports = observe_session(config, out, 0)
     early, late = run_filter(config, out, reports, (23, len(reports)))
-    (whole,) = run_filter(config, out, reports, (len(reports),))
-    assert np.array_equal(late.online, whole.online)
-    assert np.array_equal(late.grid.probability, whole.grid.probability)
-    assert np.array_equal(early.online, whole.online[:23])
-    assert len(early.path) == 23
+    ((online, _, grid),) = run_filter(config, out, reports, (len(reports),))
+    assert np.array_equal(late[0], online)
+    assert np.array_equal(late[2].probability, grid.probability)
+    assert np.array_equal(early[0], online[:23])
+    assert len(early[1]) == 23
 
 
 # Orders
@@ -133,38 +131,33 @@ def test_the_ranking_of_the_paper_holds_or_not() -> None:
     falling = {"blob": [0.5, 0.6, 0.7], "geometric": [0.4, 0.5, 0.6], "template": [0.3, 0.4, 0.5]}
     rising = dict(zip(falling, list(falling.values())[::-1], strict=True))
     mixed = falling | {"geometric": [0.4, 0.7, 0.6]}
-    words = [rank_mappers(of(EVERYWHERE, table), "ours", EVERYWHERE) for table in (falling, rising, mixed)]
-    assert [one.word for one in words if one] == ["holds", "does not hold", "not decided"]
+    words = [rank_mappers(of(EVERYWHERE, table), "ours", EVERYWHERE)[0] for table in (falling, rising, mixed)]
+    assert words == ["holds", "does not hold", "not decided"]
     # More skill is better, so the same numbers give the opposite ranking.
-    better = [rank_mappers(of(BRIER, table), "ours", BRIER) for table in (falling, rising)]
-    assert [one.word for one in better if one] == ["does not hold", "holds"]
-    assert rank_mappers(of(EVERYWHERE, {name: [0.1] for name in PAPERS}), "ours", EVERYWHERE) is None
-    assert rank_mappers(of(EVERYWHERE, falling), "as printed", EVERYWHERE) is None
+    better = [rank_mappers(of(BRIER, table), "ours", BRIER)[0] for table in (falling, rising)]
+    assert better == ["does not hold", "holds"]
+    assert not rank_mappers(of(EVERYWHERE, {name: [0.1] for name in PAPERS}), "ours", EVERYWHERE)[0]
+    assert not rank_mappers(of(EVERYWHERE, falling), "as printed", EVERYWHERE)[0]
 
 
 @given(st.lists(st.tuples(*[st.floats(0, 1)] * 3), min_size=2, max_size=6))
 def test_a_ranking_and_its_reverse_do_not_both_hold(sets: list[tuple[float, float, float]]) -> None:
     columns = [list(column) for column in zip(*sets, strict=True)]
     forth, back = (
-        rank_mappers(of(EVERYWHERE, dict(zip(PAPERS, each, strict=True))), "ours", EVERYWHERE)
+        rank_mappers(of(EVERYWHERE, dict(zip(PAPERS, each, strict=True))), "ours", EVERYWHERE)[0]
         for each in (columns, columns[::-1])
     )
-    assert forth is not None
-    assert back is not None
-    assert {forth.word, back.word} != {"holds"}
-    if forth.word == "holds":
-        assert back.word == "does not hold"
+    assert forth
+    assert {forth, back} != {"holds"}
+    if forth == "holds":
+        assert back == "does not hold"
 
 
 def test_a_constant_map_that_wins_is_reported() -> None:
     falling = {"blob": [0.5, 0.6], "geometric": [0.4, 0.5], "template": [0.3, 0.4]}
-    beaten, good = (rank_mappers(of(EVERYWHERE, falling, best=b), "ours", EVERYWHERE) for b in (0.2, 0.5))
-    assert beaten is not None
-    assert good is not None
-    assert (beaten.beaten, good.beaten) == (True, False)
-    skill = rank_mappers(of(BRIER, {name: [-0.1, -0.2] for name in PAPERS}), "ours", BRIER)
-    assert skill is not None
-    assert skill.beaten
+    beaten = [rank_mappers(of(EVERYWHERE, falling, best=b), "ours", EVERYWHERE)[2] for b in (0.2, 0.5)]
+    assert beaten == [True, False]
+    assert rank_mappers(of(BRIER, {name: [-0.1, -0.2] for name in PAPERS}), "ours", BRIER)[2]
     lines = render_rankings(
         "ours", of(EVERYWHERE, falling, best=0.2) + of(EVERYWHERE, falling, RECKONED, best=0.2)
     )

@@ -16,7 +16,6 @@ from evaluation.papers.salman2016.threshold_tuning import (
     THRESHOLDS,
     ThresholdScore,
     choose_threshold,
-    render_tuning,
     tune_threshold,
     view_differences,
 )
@@ -116,11 +115,10 @@ def test_parts_of_the_grid_are_run_tasks_and_put_together(monkeypatch):
         return ([ThresholdScore(float(t), 0.0, 20, 0) for t in part] for *_, part in tasks)
 
     monkeypatch.setattr("evaluation.papers.salman2016.threshold_tuning.run_tasks", run_tasks)
-    found = tune_threshold(parse(TINY, "tiny"), ROOT, workers=3)
+    lines = list(tune_threshold(parse(TINY, "tiny"), ROOT, workers=3))
     assert seen == [(3, 3)]
-    assert [each.threshold for each in found.scores] == list(THRESHOLDS)
-    assert 0 < found.steps[0] < found.steps[1]
-    assert "<- the winner" in render_tuning(found)
+    assert [float(line.split()[0]) for line in lines if line[2:].strip().startswith("0.")] == list(THRESHOLDS)
+    assert sum(line.endswith("<- the winner") for line in lines) == 1
 
 
 def test_invalid_configurations_are_refused(tmp_path, capsys):
@@ -141,4 +139,4 @@ def test_all_steps_need_a_view(monkeypatch):
         "evaluation.papers.salman2016.threshold_tuning.collect_session", lambda config: (config, blind)
     )
     with pytest.raises(InputError, match="without a view"):
-        tune_threshold(document, ROOT)
+        list(tune_threshold(document, ROOT))

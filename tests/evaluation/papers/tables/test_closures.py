@@ -8,7 +8,7 @@ import numpy as np
 
 from evaluation.papers.tables import closures
 from evaluation.papers.tables import touch_table as touch
-from evaluation.papers.tables.closures import JudgedSession, closures_table, fit_weights
+from evaluation.papers.tables.closures import closures_table, fit_weights
 from ratslam.mapping.closure_judge import KINDS, WEIGHTS, SequenceEvidence, shipped_weights
 
 FIT, CONTRADICT = 3, 0
@@ -22,7 +22,7 @@ def session(seed, count=60):
     counts[..., FIT] += 6 * true[:, None, None]
     counts[..., CONTRADICT] += 2 * true[:, None, None]
     evidence = SequenceEvidence(random.normal(2.0 * true - 1, 2.0), counts)
-    return JudgedSession(true, random.random(count), random.random(count) < 0.5, (evidence,) * 3)
+    return true, random.random(count), random.random(count) < 0.5, (evidence,) * 3
 
 
 def test_the_regression_finds_the_views_that_tell():
@@ -51,8 +51,8 @@ def test_every_session_is_tested_by_the_weights_of_the_others(monkeypatch, tmp_p
 
 def test_nothing_said_is_not_counted():
     one = session(0)
-    one.known[0].odometry_ratio[:10] = np.nan
-    odds = one.known[0].log_odds(fit_weights([one, session(1)]))
+    one[3][0].odometry_ratio[:10] = np.nan
+    odds = one[3][0].log_odds(fit_weights([one, session(1)]))
     assert np.isnan(odds[:10]).all()
     assert np.isfinite(odds[10:]).all()
 

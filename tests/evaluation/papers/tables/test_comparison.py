@@ -12,20 +12,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binom
 
 from evaluation.papers.tables import buildings, comparison
 from evaluation.papers.tables import touch_table as touch
 from evaluation.papers.tables.comparison import (
-    Files,
     Record,
     SessionLog,
-    StoredSession,
-    median_interval,
     paired_ratios,
     read_sessions,
     sessions_text,
-    sign_test,
 )
 from evaluation.papers.tables.recordings import Recording
 from evaluation.studies import machine
@@ -33,7 +28,6 @@ from evaluation.studies.metrics import TouchMetrics
 from ratslam.cli import main
 from tactile.base.errors import InputError
 
-ROOT = Path(__file__).parents[4]
 ROWS = ("clean", "main")
 SESSION = touch.SessionFigures(
     TouchMetrics(
@@ -53,7 +47,7 @@ Sessions = dict[tuple[str, str], Record]
 
 
 def text_of(sessions: Sessions, code: str = "code") -> str:
-    return sessions_text([StoredSession(key, code, record) for key, record in sessions.items()])
+    return sessions_text({key: (code, record) for key, record in sessions.items()})
 
 
 def write(folder: Path, sessions: Sessions, name: str = "touch.csv") -> Path:
@@ -64,7 +58,7 @@ def write(folder: Path, sessions: Sessions, name: str = "touch.csv") -> Path:
 
 def compared(folder: Path, old: Sessions, new: Sessions, rows: Sequence[str] = ROWS) -> list[dict[str, str]]:
     """The lines of the comparison by column, then those below it in a column of their own."""
-    log = SessionLog("touch", Files(against=write(folder / "old", old)), new)
+    log = SessionLog("touch", (None, write(folder / "old", old)), new)
     for (row, session), record in new.items():
         log.add(row, session, record)
     _, _, _, header, *lines = comparison.compare_runs(touch.COMPARED, log, rows)
@@ -87,7 +81,7 @@ def stub_sessions(monkeypatch: pytest.MonkeyPatch, em: dict[int, float]) -> None
 def test_each_touch_session_is_in_the_file_as_soon_as_it_is_done(tmp_path: Path, monkeypatch) -> None:
     stub_sessions(monkeypatch, {1: 0.1, 2: 0.2})  # the third one fails
     with pytest.raises(KeyError):
-        list(touch.touch_table(["clean"], 1, 3, files=Files(tmp_path / "new" / "run")))
+        list(touch.touch_table(["clean"], 1, 3, files=(tmp_path / "new" / "run", None)))
     with (tmp_path / "new" / "run" / "touch.csv").open() as file:
         one, two = csv.DictReader(file)
     assert (one["row"], one["session"], one["em"]) == ("clean", "1", "0.1")
@@ -99,8 +93,8 @@ def test_each_touch_session_is_in_the_file_as_soon_as_it_is_done(tmp_path: Path,
 
 def test_a_run_against_itself_has_ratios_of_one_and_nothing_changed(tmp_path: Path, monkeypatch) -> None:
     stub_sessions(monkeypatch, {k: 0.05 * k for k in range(1, 8)})
-    list(touch.touch_table(ROWS, 1, 7, files=Files(tmp_path)))
-    lines = list(touch.touch_table(ROWS, 1, 7, files=Files(None, tmp_path)))
+    list(touch.touch_table(ROWS, 1, 7, files=(tmp_path, None)))
+    lines = list(touch.touch_table(ROWS, 1, 7, files=(None, tmp_path)))
     clean, main_row, both, _, failures, code = lines[-6:]
     same = "1.000 [1.000-1.000] | 1.000 [1.000-1.000] | 0.100, 0.100 | 0, 0 | 0, 0 | 0.800, 0.800"
     assert clean == f"| clean | 7 | {same} | 21 / 700, 21 / 700 | 3, 3 | 0, 0 (1) |"
@@ -114,21 +108,21 @@ def test_a_run_against_itself_has_ratios_of_one_and_nothing_changed(tmp_path: Pa
 def test_buildings_write_each_run_and_compare_final_maps_worse_than_odometry(
     tmp_path: Path, monkeypatch
 ) -> None:
-    def runs(final: float, files: Files) -> list[str]:
+    def runs(final: float, files: comparison.Files) -> list[str]:
         closures, sequences = np.array([True, False]), np.array([[True, True], [True, False], [False, True]])
         figures = buildings.RunFigures(1.0, final, 1.2, closures, sequences, np.zeros(3))
         monkeypatch.setattr(buildings, "run_tasks", lambda _, tasks, workers: iter([figures] * len(tasks)))
-        return list(buildings.buildings_table(rows, 6, folder=ROOT, files=files))
+        return list(buildings.buildings_table(rows, 6, files=files))
 
     rows = {
         "lab": buildings.BuildingsRow(Recording("lab", "configs/square.yaml"), "buildings", "miscalibrated")
     }
-    runs(0.5, Files(tmp_path))
+    runs(0.5, (tmp_path, None))
     with (tmp_path / "buildings.csv").open() as file:
         first, *others = csv.DictReader(file)
     assert [one["session"] for one in others] == list("123456")
     assert list(first.values())[3:] == ["1.0", "0.5", "1.2", "2", "1", "2", "1"]
-    *_, line, _, failures, _ = runs(1.5, Files(None, tmp_path))
+    *_, line, _, failures, _ = runs(1.5, (None, tmp_path))
     assert line == (
         "| lab | 7 | 3.000 [3.000-3.000] | 1.000 [1.000-1.000] | 0.500, 1.500 | 0, 7 | 0, 0 "
         "| 7 / 14, 7 / 14 | 7 / 14, 7 / 14 | 0, 7 | 0, 7 (0.016) |"
@@ -170,7 +164,7 @@ def test_what_is_unknown_or_in_one_run_alone_is_left_out_and_said(tmp_path: Path
 def test_figures_of_any_name_are_compared_where_both_runs_know_them(tmp_path: Path) -> None:
     old: Sessions = {("a", "1"): {"missed": False, "error": 2.0}, ("a", "2"): {"missed": True, "error": 1.0}}
     new: Sessions = {("a", "1"): {"missed": True, "error": np.nan}, ("a", "2"): {"missed": False, "error": 3}}
-    log = SessionLog("maps", Files(against=write(tmp_path, old, "maps.csv")), new)
+    log = SessionLog("maps", (None, write(tmp_path, old, "maps.csv")), new)
     for (row, session), record in new.items():
         log.add(row, session, record)
     *_, missed, error, _, failures, _ = comparison.compare_figures(log, ["a"])
@@ -183,22 +177,6 @@ def test_ratios_of_zero_infinity_and_nan() -> None:
     old = np.array([0, 0, 2, np.inf, np.inf, 1, np.nan, 1])
     new = np.array([0, 3, 0, np.inf, 1, np.inf, 1, np.nan])
     np.testing.assert_array_equal(paired_ratios(old, new), [1, np.inf, 0, 1, 0, np.inf, np.nan, np.nan])
-
-
-def test_the_interval_of_a_median_has_the_published_ranks() -> None:
-    """Ranks of the 95 % interval as in tables of the sign test, such as Conover 1999, and coverage."""
-    ranks = {6: 1, 8: 1, 9: 2, 12: 3, 15: 4, 20: 6, 25: 8, 40: 14}
-    for n, k in ranks.items():
-        assert median_interval(np.random.default_rng(n).permutation(n) + 1.0) == (k, n + 1 - k)
-        assert 1 - 2 * binom.cdf(k - 1, n, 0.5) >= 0.95 > 1 - 2 * binom.cdf(k, n, 0.5)
-    assert np.isnan(median_interval(np.arange(5.0))).all()
-    assert np.isnan(median_interval(np.zeros(0))).all()
-
-
-def test_the_sign_test_is_exact() -> None:
-    assert sign_test(0, 0) == sign_test(3, 3) == 1
-    assert sign_test(0, 6) == sign_test(6, 0) == pytest.approx(2 / 2**6)
-    assert sign_test(1, 7) == pytest.approx(2 * 9 / 2**8)
 
 
 def test_other_code_has_another_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,20 +200,21 @@ def test_other_code_has_another_digest(tmp_path: Path, monkeypatch: pytest.Monke
 def test_a_file_is_read_as_it_was_written(tmp_path_factory, sessions: Sessions) -> None:
     path = tmp_path_factory.mktemp("run") / "touch.csv"
     path.write_text(text_of(sessions, "abc classic"))
-    read = read_sessions(path).values()
-    assert {one.key: one.figures for one in read} == sessions
-    assert all(one.code == "abc classic" for one in read)
+    read = read_sessions(path)
+    assert read == {key: ("abc classic", figures) for key, figures in sessions.items()}
     assert all(
-        type(value) is type(sessions[one.key][name]) for one in read for name, value in one.figures.items()
+        type(value) is type(sessions[key][name])
+        for key, (_, figures) in read.items()
+        for name, value in figures.items()
     )
 
 
 def test_a_file_keeps_other_sessions_with_the_code_that_measured_them(tmp_path: Path, monkeypatch) -> None:
     def add(row: str, em: float, settings: str) -> dict[str, tuple[str, object]]:
-        log = SessionLog("touch", Files(tmp_path), [(row, "1")], settings)
+        log = SessionLog("touch", (tmp_path, None), [(row, "1")], settings)
         log.add(row, 1, {"em": em})
         read = read_sessions(tmp_path / "touch.csv")
-        return {key[0]: (one.code, one.figures["em"]) for key, one in read.items()}
+        return {key[0]: (code, figures["em"]) for key, (code, figures) in read.items()}
 
     monkeypatch.setattr(comparison, "code_digest", lambda: "a")
     assert add("clean", 0.1, "recall") == {"clean": ("a recall", 0.1)}
@@ -276,9 +255,9 @@ def test_a_file_of_an_earlier_run_or_of_others_is_not_written_over(tmp_path: Pat
     file = write(tmp_path, {("clean", "1"): figures(0.3)}) / "touch.csv"
     before = file.read_bytes()
     with pytest.raises(InputError, match="is the folder of -o too"):
-        next(touch.touch_table(["clean"], 1, 1, files=Files(tmp_path, tmp_path)))
+        next(touch.touch_table(["clean"], 1, 1, files=(tmp_path, tmp_path)))
     assert file.read_bytes() == before
     file.write_text("theirs\n1\n")
     with pytest.raises(InputError, match="without 'row'"):
-        next(touch.touch_table(["clean"], 1, 1, files=Files(tmp_path)))
+        next(touch.touch_table(["clean"], 1, 1, files=(tmp_path, None)))
     assert file.read_text() == "theirs\n1\n"

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from evaluation.papers.tables import health
-from evaluation.papers.tables.health import JudgedMaps, fit_weights
-
-ROOT = Path(__file__).parents[4]
+from evaluation.papers.tables.health import fit_weights
 
 
 def judged(seed, count=80):
@@ -18,7 +14,7 @@ def judged(seed, count=80):
     random = np.random.default_rng(seed)
     features = random.normal(size=(count, 5))
     bad = features[:, 0] + 0.3 * random.normal(size=count) < -0.5
-    return JudgedMaps(features, np.where(bad, 2.0, 0.5), bad, random.integers(1, 50, count))
+    return np.column_stack([features, np.where(bad, 2.0, 0.5), bad, random.integers(1, 50, count)])
 
 
 def test_the_regression_finds_the_feature_that_tells():
@@ -29,7 +25,7 @@ def test_the_regression_finds_the_feature_that_tells():
 
 def test_the_regression_does_not_depend_on_the_units_of_features():
     maps, units = judged(0), np.array([1.0, 10.0, 0.1, 3.0, 1.0])
-    scaled = fit_weights(maps._replace(features=maps.features * units))
+    scaled = fit_weights(maps * [*units, 1, 1, 1])
     assert scaled[1:] * units == pytest.approx(fit_weights(maps)[1:], rel=1e-3, abs=1e-4)
 
 
@@ -46,6 +42,6 @@ def test_every_second_session_tests_the_regression(monkeypatch):
 
 @pytest.mark.parametrize("row", health.TOUCH)
 def test_rows_are_valid_configurations(row):
-    config, touch = health.task_config(row, 3, ROOT)
+    config, touch = health.task_config(row, 3)
     assert touch
     assert config.simulation.maze.seed == health.FIRST_MAZE + 3

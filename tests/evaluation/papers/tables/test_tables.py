@@ -27,7 +27,7 @@ METRICS = TouchMetrics(
 SESSION = touch.SessionFigures(
     METRICS, revisits_closed=0.8, em_live=0.04, em_pieces=0.008, unjoined=0.1, across=40, recovery=()
 )
-ARENA = grid.GridFigures(0.02, 0.2, np.radians([1.0, 20.0]), 4, (0.9, 0.4, 0.3, 0.04, 0.05))
+ARENA = 0.02, 0.2, np.radians([1.0, 20.0]), 4, [0.9, 0.4, 0.3, 0.04, 0.05]
 
 
 def stub_sessions(monkeypatch, module, result):
@@ -119,7 +119,8 @@ def test_a_grid_row_compares_with_dead_reckoning(monkeypatch):
 def test_all_rows_of_the_laser_table_without_data_are_named(monkeypatch, tmp_path):
     monkeypatch.delenv(recordings.DATA, raising=False)
     stub_sessions(monkeypatch, buildings, lambda task: pytest.fail("a session without a recording"))
-    text = "\n".join(buildings.laser_table(folder=tmp_path))
+    monkeypatch.chdir(tmp_path)
+    text = "\n".join(buildings.laser_table())
     assert all(f"Left out: {row}: " in text for row in buildings.ROWS)
     assert "set RATSLAM_DATA" in text
 
@@ -155,7 +156,7 @@ def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(m
     )
     harmed = harmless._replace(odometry=2.0, final=2.5, live=2.0)
     tasks = stub_sessions(monkeypatch, buildings, lambda task: harmed if task[2] == 2 else harmless)
-    _, lab, ids, _, total, note = buildings.buildings_table(rows, copies=2, folder=ROOT)
+    _, lab, ids, _, total, note = buildings.buildings_table(rows, copies=2)
     assert [task[1:] for task in tasks[:3]] == [("miscalibrated", seed) for seed in range(3)]
     assert lab == (
         "| lab | 10.00 | 1.00 | 10.80 | 1.75, 2.50 | 6.40, 10.80 | 1.25 | 1, 0 of 3 | 1 / 2 | 3 / 6 | 3 / 6 |"
@@ -170,10 +171,10 @@ def test_a_row_of_buildings_counts_false_closures_and_runs_worse_than_odometry(m
 def test_the_create_is_mapped_at_nine_settings_without_copies(monkeypatch):
     figures = buildings.RunFigures(1.0, 0.5, 2.0, np.zeros(0, bool), np.zeros((0, 2), bool), np.zeros(0))
     tasks = stub_sessions(monkeypatch, buildings, lambda task: figures)
-    monkeypatch.setattr(recordings.Recording, "missing", lambda self, folder: "")
+    monkeypatch.setattr(recordings.Recording, "missing", lambda self: "")
     monkeypatch.setenv(recordings.DATA, ".")
     rows = buildings.choose_rows(["create"])
-    lines = list(buildings.buildings_table(rows, copies=2, folder=ROOT))
+    lines = list(buildings.buildings_table(rows, copies=2))
     configs = [task[0] for task in tasks]
     assert [task[2] for task in tasks] == [0] * 9
     assert len({config.recall.sector_fov for config in configs}) == 3
@@ -193,7 +194,7 @@ def test_a_recording_in_the_folder_of_buildings_is_a_row(tmp_path, monkeypatch):
     assert buildings.choose_rows(None) == rows
     present = buildings.choose_rows(["tuc", "room"])
     assert list(present) == ["room", "tuc"]
-    _, room, _, total, missing = buildings.buildings_table(present, copies=1, workers=1, folder=ROOT)
+    _, room, _, total, missing = buildings.buildings_table(present, copies=1, workers=1)
     cells = room.split(" | ")
     assert cells[0] == "| room"
     assert cells[7].endswith("of 2")
@@ -203,11 +204,11 @@ def test_a_recording_in_the_folder_of_buildings_is_a_row(tmp_path, monkeypatch):
     assert missing.endswith("tuc_lecture_hall_odom.csv does not exist")
 
 
-def test_all_rows_of_the_buildings_table_without_data_are_named(monkeypatch, tmp_path):
+def test_all_rows_of_the_buildings_table_without_data_are_named(monkeypatch):
     monkeypatch.delenv(recordings.DATA, raising=False)
     stub_sessions(monkeypatch, buildings, lambda task: pytest.fail("a session without a recording"))
     rows = buildings.buildings_rows()
-    text = "\n".join(buildings.buildings_table(rows, folder=tmp_path))
+    text = "\n".join(buildings.buildings_table(rows))
     assert all(f"Left out: {row}: set RATSLAM_DATA" in text for row in rows)
     assert "buildings" in rows
 
@@ -258,7 +259,7 @@ def test_the_command_refuses_unknown_rows(capsys):
 def test_the_batch_table_times_networks_sets_and_sessions(monkeypatch):
     for name, value in {"BATCH_SIZES": (11,), "SINGLE": 4, "FEW": 4, "RECORDED": 2}.items():
         monkeypatch.setattr(speed, name, value)
-    lines = list(speed.batch_table(sets=10, sessions=3, steps=40, rounds=1, folder=ROOT))
+    lines = list(speed.batch_table(sets=10, sessions=3, steps=40, rounds=1))
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[1:]]
     assert [what.split(",")[0] for what, _, _ in rows] == [
         "one network of 11 cells a side", "one network of 11 cells a side", "2 sets of 21 cells",
@@ -270,7 +271,7 @@ def test_the_batch_table_times_networks_sets_and_sessions(monkeypatch):
 
 def test_the_cycle_table_times_replayed_and_live_steps(monkeypatch):
     monkeypatch.setattr(cycles, "BACKENDS", ("classic",))
-    _, *lines = cycles.cycle_table(["square"], rounds=1, folder=ROOT)
+    _, *lines = cycles.cycle_table(["square"], rounds=1)
     for line, dtype in zip(lines, ("float64", "float32"), strict=True):
         name, backend, precision, steps, *times = [cell.strip() for cell in line.split("|")[1:-1]]
         assert (name, backend, precision, steps) == ("square", "classic", dtype, "349")
@@ -281,7 +282,7 @@ def test_the_cycle_table_times_replayed_and_live_steps(monkeypatch):
 
 
 def test_the_parts_of_a_cycle_add_up_to_its_time():
-    header, *lines = cycles.profile_table(["square"], folder=ROOT)
+    header, *lines = cycles.profile_table(["square"])
     assert "square, recall" in header
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
     assert [name for name, *_ in rows] == [*cycles.PARTS, "all"]

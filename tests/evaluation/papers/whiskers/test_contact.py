@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evaluation.papers.tables.recordings import REACH
 from evaluation.papers.whiskers.contact import baseline_of
-from evaluation.papers.whiskers.recordings import REACH
 from robot.recordings.real_whiskers import WHISKERS, ReachConfig, read_reach
 from tactile.base.samples import true_runs
 from tactile.calibration import calibrate_free

@@ -40,9 +40,9 @@ def result():
 
 def test_a_contact_counts_once_and_by_its_first_reading():
     position = np.array([[2.0, 1.0], [2.0, 0.2], [2.0, 0.3], [2.0, 1.5], [3.9, 1.5], [5.0, 4.0]])
-    found = wall_distances(position, np.array([0, 1, 1, 0, 1, 0], bool), ROOM)
-    np.testing.assert_allclose(found.contact, [0.2, 0.1])
-    np.testing.assert_allclose(found.all, [1.0, 0.2, 0.3, 1.5, 0.1, np.sqrt(2)])
+    contact, every = wall_distances(position, np.array([0, 1, 1, 0, 1, 0], bool), ROOM)
+    np.testing.assert_allclose(contact, [0.2, 0.1])
+    np.testing.assert_allclose(every, [1.0, 0.2, 0.3, 1.5, 0.1, np.sqrt(2)])
 
 
 def test_true_revisits_are_of_the_same_place_and_heading():

@@ -9,7 +9,7 @@ import pytest
 
 from evaluation.papers import figure as figures_of_papers
 from evaluation.papers.figure import REAL, Figure, find_figure, write_page
-from evaluation.papers.whiskers.recordings import UNPROVEN, require_recordings
+from evaluation.papers.tables.recordings import UNPROVEN, require_recordings
 from tactile.base.errors import InputError
 
 

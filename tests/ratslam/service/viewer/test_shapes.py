@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.service.viewer_process import POINTS, VerdictLog, whisker_curves
-from tactile.whisker_geometry import HeadConfig, tip_points, ur10_head
+from tactile.whisker_geometry import HeadConfig, shaft_points, ur10_head
 
 HEAD = ur10_head(HeadConfig())
 WHISKERS = len(HEAD.length)
@@ -20,7 +20,7 @@ def test_free_whiskers_are_straight_to_their_tips():
     curves = whisker_curves(HEAD, free, np.full((WHISKERS, 2), 9.0), np.full(WHISKERS, 9.0))
     assert curves.shape == (WHISKERS, POINTS, 3)
     assert np.allclose(curves[:, 0], HEAD.base, atol=1e-12)
-    assert np.allclose(curves[:, -1], tip_points(HEAD, np.zeros(WHISKERS)), atol=1e-12)
+    assert np.allclose(curves[:, -1], shaft_points(HEAD, np.zeros(WHISKERS), HEAD.length), atol=1e-12)
     along = curves - HEAD.base[:, None]
     assert np.allclose(np.cross(along, HEAD.rest[:, None]), 0.0, atol=1e-12)
 

@@ -10,8 +10,6 @@ import pytest
 from robot.recordings.real_whiskers import (
     STAGE,
     StageConfig,
-    StageRecording,
-    cut_sweep,
     read_stage,
     read_stage_calibration,
 )
@@ -22,19 +20,11 @@ HEADER = ",px,py,pz,sx,sy,sz"
 ROW = "0,1.0,2.0,3.0,4.0,5.0,6.0"
 
 
-def test_a_sweep_is_in_metres_and_starts_after_the_way_to_its_start() -> None:
-    whole = read_stage(SLICES / "stage_cylinder_2.csv")
-    assert whole.position.shape == whole.signal.shape == (101, 3)
-    assert whole.signal[0].tolist() == [0.0, 0.0, 0.0]
-    sweep = cut_sweep(whole)
-    assert len(sweep.position) == 100
-    np.testing.assert_allclose(np.diff(sweep.position, axis=0), [[-0.07 / 99, 0.0, 0.0]] * 99, atol=1e-9)
-
-
-def test_a_sweep_with_even_steps_is_left_whole() -> None:
-    position = np.outer(np.arange(5.0), [1.0, 0.0, 0.0])
-    sweep = StageRecording(position, np.ones((5, 3)), "")
-    assert len(cut_sweep(sweep).position) == 5
+def test_a_sweep_is_in_metres() -> None:
+    sweep = read_stage(SLICES / "stage_cylinder_2.csv")
+    assert sweep.position.shape == sweep.signal.shape == (101, 3)
+    assert sweep.signal[0].tolist() == [0.0, 0.0, 0.0]
+    np.testing.assert_allclose(np.diff(sweep.position[1:], axis=0), [[-0.07 / 99, 0.0, 0.0]] * 99, atol=1e-9)
 
 
 def test_a_calibration_is_above_the_signal_at_the_base() -> None:
