@@ -8,7 +8,6 @@ that both maps hold, keyframes that are equal to the bit, are found by `overlap`
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from hashlib import blake2b
 from typing import NamedTuple
 
@@ -196,21 +195,11 @@ LEAST = 8
 rows of coarse odometry and of views without contact may be equal by chance, but not in one order."""
 
 
+Span = tuple[int, int]
+
 Remembered = tuple[dict[bytes, int], np.ndarray]
 """The keyframes of a map, to be found again in other maps: the number of the first keyframe of each name,
 where equal names are equal keyframes; and the steps [N] at which the keyframes were taken."""
-
-
-class Overlap(NamedTuple):
-    """Keyframes of one session in two maps.
-
-    Attributes:
-        keyframes: their number. one, other: first and last step of them in each map.
-    """
-
-    keyframes: int
-    one: tuple[int, int]
-    other: tuple[int, int]
 
 
 def remembered(map: KeyframeMap) -> Remembered:
@@ -226,8 +215,9 @@ def remembered(map: KeyframeMap) -> Remembered:
     return first, map.keyframe_steps()
 
 
-def overlap(one: Remembered, other: Remembered) -> Overlap | None:
-    """What two maps have of one session; None if nothing."""
+def overlap(one: Remembered, other: Remembered) -> tuple[int, Span, Span] | None:
+    """The number of keyframes of one session that two maps have, and their first and last step in each; None
+    if there are none."""
     (known, steps), (again, other_steps) = one, other
     pairs = [(number, again[name]) for name, number in known.items() if name in again]
     apart = Counter(second - first for first, second in pairs)
@@ -236,8 +226,5 @@ def overlap(one: Remembered, other: Remembered) -> Overlap | None:
     common = np.array([pair for pair in pairs if pair[1] - pair[0] in shifts], int).reshape(-1, 2)
     if not len(common):
         return None
-    return Overlap(len(common), _ends(steps[common[:, 0]]), _ends(other_steps[common[:, 1]]))
-
-
-def _ends(steps: Sequence[int] | np.ndarray) -> tuple[int, int]:
-    return int(np.min(steps)), int(np.max(steps))
+    spans = (steps[common[:, 0]], other_steps[common[:, 1]])
+    return len(common), *((int(span.min()), int(span.max())) for span in spans)
