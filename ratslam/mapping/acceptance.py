@@ -21,7 +21,7 @@ from scipy.special import expit
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.archive import Archive
-from ratslam.mapping.closure_judge import AT_ONCE, judge_newest
+from ratslam.mapping.closure_judge import AT_ONCE, judge_sequences
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import CONFIRMED_WEIGHT, Candidate, ClosureLog, Verdict
 from ratslam.mapping.map_solution import MapSolution, cheapest_map, solved_map
@@ -29,11 +29,9 @@ from ratslam.mapping.odometry_scan import OdometryScan
 from ratslam.mapping.optimizer import CalibrationPrior
 from ratslam.mapping.verification import (
     break_odometry,
-    joins_pieces,
     judge_by_map,
     map_distance,
-    spans_beginnings,
-    spans_pieces,
+    spans,
 )
 
 
@@ -63,7 +61,8 @@ class AcceptByEvidence(Acceptance):
 
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
         config, score, length = graph.config, log.score(sequence), len(log.members(sequence))
-        if log.verdict(sequence) != Verdict.OPEN or joins_pieces(graph, log, candidate):
+        piece = graph.pieces(log)
+        if log.verdict(sequence) != Verdict.OPEN or piece[candidate.keyframe] != piece[candidate.match]:
             return False
         if length < config.min_length or score < config.min_score:
             return False
@@ -71,7 +70,8 @@ class AcceptByEvidence(Acceptance):
         fits = distance < config.max_distance and score - distance / 2 >= config.min_score
         accepted = fits
         if fits and config.select_every:  # an unlikely sequence waits for the next selection
-            accepted = not judge_newest(graph, log, sequence) < AT_ONCE
+            (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence]))
+            accepted = not odds < AT_ONCE
         log.judge(sequence, Verdict.ACCEPTED if accepted else Verdict.OPEN, distance)
         carried = config.may_be_carried and not config.select_every  # selection places its own cuts
         broken = carried and length >= config.break_length and score >= config.break_score
@@ -178,7 +178,7 @@ class AcceptByOdds(Acceptance):
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
         while len(self._log_ratio.rows) < log.sequences:
             self._log_ratio.append(np.full(len(self._scan.grid), np.nan))
-        length, accepted = log.size(sequence), log.verdict(sequence) == Verdict.ACCEPTED
+        length, accepted = int(log.sizes()[sequence]), log.verdict(sequence) == Verdict.ACCEPTED
         if length < graph.config.min_length:
             return False
         # The middle of a growing sequence moves on slowly: it is compared anew only at lengths of at most
@@ -247,12 +247,10 @@ class AcceptByOdds(Acceptance):
         Args:
             sequences, score_odds, odds: see `_vote`.
         """
-        open_ = log.verdicts()[sequences] == Verdict.OPEN
-        open_ &= (
-            np.isin(sequences, among) & (log.left() > 0)[sequences] & ~spans_pieces(graph, log)[sequences]
-        )
+        open_ = (log.verdicts()[sequences] == Verdict.OPEN) & np.isin(sequences, among)
+        open_ &= ((log.left() > 0) & ~spans(graph.pieces(log), log))[sequences]
         # No odometry prior at the start of a piece: only the map judges there.
-        accepted = (odds >= MIN_LOG_ODDS) & ~spans_beginnings(graph.begins.rows, log)[sequences]
+        accepted = (odds >= MIN_LOG_ODDS) & ~spans(np.cumsum(graph.begins.rows), log)[sequences]
         undecided = open_ & ~accepted & (score_odds + np.log(graph.count) > 0)
         doubtful = open_ & accepted & graph.config.may_be_carried
         if (undecided | doubtful).any():
@@ -275,8 +273,8 @@ class AcceptByOdds(Acceptance):
     def _break(self, graph: KeyframeGraph, log: ClosureLog, sequence: int) -> bool:
         """Cuts the odometry where a long sequence contradicts it, if the robot may be carried."""
         config = graph.config
-        long = log.size(sequence) >= config.break_length and log.score(sequence) >= config.break_score
-        apart = bool(spans_pieces(graph, log)[sequence])
+        long = log.sizes()[sequence] >= config.break_length and log.score(sequence) >= config.break_score
+        apart = bool(spans(graph.pieces(log), log)[sequence])
         if not (config.may_be_carried and long) or apart or log.verdict(sequence) != Verdict.OPEN:
             return False
         break_odometry(graph, log, sequence)

@@ -61,9 +61,8 @@ class SequenceEvidence(NamedTuple):
 
     Attributes:
         odometry_ratio: [n] R; NaN where odometry is broken between the keyframes that a sequence joins,
-        about
-            which nothing is said. counts: [n, 2, 2, KINDS] views of each kind: over the map and over the
-            older pass; of the sequence and around it.
+            about which nothing is said. counts: [n, 2, 2, KINDS] views of each kind: over the map and over
+            the older pass; of the sequence and around it.
     """
 
     odometry_ratio: np.ndarray
@@ -111,12 +110,6 @@ def judge_anew(graph: KeyframeGraph, log: ClosureLog, sequences: np.ndarray) -> 
     by merging the former ones stay."""
     whole = sequences[[not log.has_merged(k) for k in sequences.tolist()]]
     log.set_log_odds(whole, judge_sequences(graph, graph.fit(), log, graph.cut, whole))
-
-
-def judge_newest(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> float:
-    """Log-odds of a sequence of the present map."""
-    (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence])).tolist()
-    return float(odds)
 
 
 def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> float:

@@ -50,7 +50,7 @@ class SelectionProblem(NamedTuple):
         evidence: [R] log-likelihood ratios.
         first, last: [R] first and last keyframe of each sequence.
         views_cost: what the views say against poses [N, 3], chi-square.
-        place: moves pieces of the map that are joined together, see `PiecePlacement.place`.
+        place: moves pieces of the map that are joined together, see `placed_pieces`.
     """
 
     measurements: MapProblem

@@ -125,10 +125,6 @@ class ClosureLog(Checkpointed):
         following = self._begun[sequence + 1 : sequence + 2]
         return slice(self._begun[sequence], following[0] if following else None)
 
-    def size(self, sequence: int) -> int:
-        """Number of candidates of a sequence, merged ones included."""
-        return len(self.members(sequence)) + int(self._merged.rows[sequence, 1])
-
     def scores(self) -> np.ndarray:
         """[R] evidence of every sequence, merged candidates included."""
         rows, known = self._candidate.rows, self._candidate.rows[:, 3] >= 0

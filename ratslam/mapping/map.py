@@ -9,7 +9,7 @@ the odometry is cut where the views indicate it, and the sequence joins the part
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,11 +37,10 @@ from ratslam.mapping.map_solution import (
     worse_than_odometry,
 )
 from ratslam.mapping.odometry_calibration import calibration_from_views, write_calibration
-from ratslam.mapping.piece_ties import FindTie, tie_newest_piece
 from ratslam.mapping.pose_graph import Edges, write_g2o, write_json
 from ratslam.mapping.selection_worker import SelectionWorker
 from ratslam.mapping.step_record import NO_TRAVEL, LiveFilter, StepRecord, Travel, leading_to
-from ratslam.mapping.verification import continues_sequence, has_same_heading
+from ratslam.mapping.verification import continues_sequence, has_same_heading, spans
 from ratslam.recall.memory import MapFeedback, MergedRows
 from tactile.base.types import Observation
 
@@ -50,6 +49,18 @@ if TYPE_CHECKING:
 
 DOUBT_EVERY = 50
 """Keyframes between two judgements of the present map."""
+TIE_EVERY = 4
+"""Keyframes between two trials of a tie of the newest piece to older keyframes."""
+YOUNG = 400
+"""Number of keyframes of a piece up to which its tie is tried: one that later views contradict is undone."""
+
+Tie = tuple[float, Sequence[Candidate]]
+"""A placement of the newest piece: its log-odds less the logarithm of the number of places (where those of
+another placement are within half of `tie_log_odds`, the difference to the largest of these), and the closures
+that it implies."""
+FindTie = Callable[[KeyframeGraph, ClosureLog, Archive, LearnedOdds], Tie | None]
+"""Finds the best placement of the keyframes since the newest beginning among those before, and keeps the
+odds that it learns for these; None without any."""
 
 
 class KeyframeMap(Checkpointed, Map):
@@ -370,13 +381,38 @@ class KeyframeMap(Checkpointed, Map):
             self._forget_solution()
         self.selection.begin(graph, log)
         self.merger.select(graph, log)
-        if self._find_tie and tie_newest_piece(graph, log, self.archive, self._tie_odds, self._find_tie):
+        if self._find_tie and self._tie_newest_piece(self._find_tie):
             self._optimise()
         if graph.total % DOUBT_EVERY == 0:
             self._doubt = worse_than_odometry(graph, MapSolution(graph.fit(), log, graph.cut))
             if not self.config.select_every:  # sequences are then confirmed by each judgement instead
                 log.count_selection()
                 self.merger.note_selection(graph)
+
+    def _tie_newest_piece(self, find: FindTie) -> bool:
+        """If a trial is due: ties the newest piece where the evidence suffices, or undoes its tie where the
+        views contradict it; whether the map has changed."""
+        graph, log = self._graph, self.log
+        starts = np.flatnonzero(graph.begins.rows)
+        if graph.total % TIE_EVERY or not len(starts) or graph.count - starts[-1] > YOUNG:
+            return False
+        log_odds, closures = find(graph, log, self.archive, self._tie_odds) or (-np.inf, ())
+        # Accepted sequences between keyframes before the newest beginning and since.
+        newest = np.arange(graph.count) >= starts[-1]
+        across = np.flatnonzero(spans(newest, log) & (log.verdicts() == Verdict.ACCEPTED))
+        if not len(across):
+            if log_odds < self.config.tie_log_odds:
+                return False
+            for k, candidate in enumerate(closures):
+                sequence = log.add(candidate, k > 0)
+                self.archive.add(candidate, k > 0, graph)
+                log.judge(sequence, Verdict.ACCEPTED)
+        elif log_odds >= self.config.tie_log_odds / 2:
+            return False
+        for sequence in across.tolist():
+            log.judge(sequence, Verdict.UNDONE)
+        graph.place_pieces(log)
+        return True
 
     def _given(self) -> MapSolution:
         """The final map, or odometry without closures where that is doubted."""

@@ -119,7 +119,7 @@ class SelectedMap(Checkpointed):
         graph.heading_noise = self.noise
         moved = compose(self.poses[-1], inverse(graph.pose.rows[size - 1]))
         poses = np.concatenate([self.poses, compose(moved, graph.pose.rows[size:])])
-        start = MapFit(graph.placement(log).place(poses), bias, np.zeros(0), turn_error)
+        start = MapFit(graph.placement(log)(poses), bias, np.zeros(0), turn_error)
         fit = solve(start, graph.problem(log, graph.cut), STEPS, FINE)
         log.weigh(fit.weights)
         graph.move_to(fit, log)
