@@ -40,8 +40,7 @@ class Archive(Checkpointed):
     Attributes:
         graph: its keyframes, [E]. log: its candidates. Poses and verdicts are those of the last `follow`.
         row: [E] the keyframe of the map that each is or is merged with. offset: [E, 3] its pose in the
-        frame
-            of that one, m, m, rad.
+            frame of that one, m, m, rad.
         pairs: [P, 3] confirmed pairs of which a keyframe was merged, the newest ones.
     """
 

@@ -169,8 +169,7 @@ class ClosureLog(Checkpointed):
 
         Args:
             gone: [N] bool, merged keyframes. onto: [N] new number of each keyframe, or of the one that it
-            is
-                merged with. turned: [N] bool: faces opposite to that one.
+                is merged with. turned: [N] bool: faces opposite to that one.
         """
         rows, evidence = self._candidate.rows, self._evidence.rows
         lost = gone[rows[:, 0]]
@@ -319,8 +318,7 @@ class ClosureLog(Checkpointed):
 
         Args:
             angle: turn per sector shift, rad. variance: [3] of a closure. scales: robust scale per unit of
-            a
-                sequence's evidence, least scale, largest scale.
+                a sequence's evidence, least scale, largest scale.
         """
         rows = self._candidate.rows[self.accepted_rows()]
         sequences, sequence = np.unique(rows[:, 3], return_inverse=True)

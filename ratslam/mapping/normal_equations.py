@@ -82,56 +82,16 @@ def elimination_order(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     for low fill-in."""
     if not count:
         return np.zeros(0, np.int64)
-    start, row = neighbours(count, a, b)
-    column = np.repeat(np.arange(count), np.diff(start))
+    node = np.arange(count)
+    ends = np.concatenate([node, a, b]), np.concatenate([node, b, a])
+    matrix = csc_matrix((np.ones(len(ends[0])), ends), (count, count))
     # Only the sparsity pattern matters; the diagonal makes the matrix regular.
-    values = np.where(row == column, 4.0 * len(a) + 1, 1.0)
-    matrix = csc_matrix((values, row, start), (count, count))
+    matrix.data[:] = 1.0
+    matrix.setdiag(4.0 * len(a) + 1)
     options = {"SymmetricMode": True}
     # One column at a time, because there is little fill-in.
     factor = splu(matrix, "MMD_AT_PLUS_A", relax=1, panel_size=1, options=options, diag_pivot_thresh=0.0)
     return factor.perm_c.astype(np.int64)
-
-
-@compiled
-def neighbours(count: int, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the column of each of n nodes begins [n + 1], and the rows of the columns, ascending: the node
-    itself and those that an edge from a [M] to b [M] joins it to."""
-    start = np.zeros(count + 1, np.int32)
-    for m in range(len(a)):
-        start[a[m] + 1] += 1
-        start[b[m] + 1] += 1
-    for k in range(count):
-        start[k + 1] += start[k] + 1
-    rows, end = np.empty(start[count], np.int32), start[:count].copy()
-    for k in range(count):
-        _insert(rows, start[k], end, k, k)
-    for m in range(len(a)):
-        _insert(rows, start[a[m]], end, a[m], b[m])
-        _insert(rows, start[b[m]], end, b[m], a[m])
-    kept = 0
-    for k in range(count):
-        first, start[k] = start[k], kept
-        for p in range(first, end[k]):
-            rows[kept] = rows[p]
-            kept += 1
-    start[count] = kept
-    return start, rows[:kept]
-
-
-@compiled
-def _insert(rows: np.ndarray, first: int, end: np.ndarray, column: int, row: int) -> None:
-    """Puts a row into its place among the ascending `rows` of a column, which begin at `first` and end
-    before end[column], unless it is there."""
-    p = end[column]
-    while p > first and rows[p - 1] > row:
-        p -= 1
-    if p > first and rows[p - 1] == row:
-        return
-    for q in range(end[column], p, -1):
-        rows[q] = rows[q - 1]
-    rows[p] = row
-    end[column] += 1
 
 
 _Layout = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -498,14 +458,3 @@ class Equations(NamedTuple):
             return np.full(border.shape, np.inf), np.zeros(self.corner.shape)
         bent = self.factor.solve(border)
         return bent, self.corner - np.tensordot(border, bent, axes=((0, 1), (0, 1)))
-
-
-def empty_blocks(pattern: BlockPattern, parameters: int) -> Blocks:
-    """Equations without measurements."""
-    return (
-        np.zeros((pattern.count, 3, 3)),
-        np.zeros((len(pattern.row), 3, 3)),
-        np.zeros((pattern.count, 3, 1 + parameters)),
-        np.zeros((parameters, parameters)),
-        np.zeros(parameters),
-    )

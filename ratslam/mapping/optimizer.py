@@ -23,7 +23,6 @@ from ratslam.mapping.normal_equations import (
     Equations,
     Measurements,
     add_measurements,
-    empty_blocks,
     measurement_errors,
     weigh_closures,
 )
@@ -327,7 +326,11 @@ class System:
         poses = np.ascontiguousarray(fit.poses)
         measured, error, chi2 = self._errors(fit)
         trust, weights, _ = weigh_closures(chi2, *self._closures)
-        diagonal, above, right, corner, slope = empty_blocks(self._pattern, self._parameters)
+        n, blocks, parameters = self._pattern.count, len(self._pattern.row), self._parameters
+        diagonal, above, right = (
+            np.zeros(shape) for shape in ((n, 3, 3), (blocks, 3, 3), (n, 3, 1 + parameters))
+        )
+        corner, slope = np.zeros((parameters, parameters)), np.zeros(parameters)
         add_measurements(self._edges, poses, measured, error, trust, (diagonal, above, right, corner, slope))
         off, tight = _calibration(fit, self._problem.prior)
         return Equations(

@@ -176,8 +176,7 @@ def _add_edges(
 
     Args:
         ends: [E] position of either node in the order of elimination, -1 for node 0, and the block above
-        the
-            diagonal. blocks: diagonal [n, 3, 3], above [B, 3, 3], right [n, 3, 1].
+            the diagonal. blocks: diagonal [n, 3, 3], above [B, 3, 3], right [n, 3, 1].
     """
     (at_i, at_j, slot), (error, by_i, by_j), (diagonal, above, right) = ends, errors, blocks
     pull, tight = np.empty(3), np.empty((3, 3))

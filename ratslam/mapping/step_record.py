@@ -147,8 +147,7 @@ class LiveFilter(Checkpointed):
 
     Attributes:
         covariance: [3, 3] in the frame of the map, m, m, rad. strayed: sum of the corrections since the
-        last
-            optimisation, standard deviations of a closure.
+            last optimisation, standard deviations of a closure.
     """
 
     VALUES = ("covariance", "strayed")

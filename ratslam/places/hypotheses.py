@@ -33,11 +33,10 @@ BESIDE_SHARE = 0.3
 
 
 class Path(NamedTuple):
-    """A pose hypothesis followed through n keyframes: poses [n, 3], m, m, rad; covariances [n, 3, 3]; and
-    log-odds [n] of each keyframe, nat."""
+    """A pose hypothesis followed through n keyframes: poses [n, 3], m, m, rad, and log-odds [n] of each
+    keyframe, nat."""
 
     poses: np.ndarray
-    covariances: np.ndarray
     odds: np.ndarray
 
     def odds_beside(self, ground: Ground) -> np.ndarray:
@@ -82,18 +81,17 @@ def follow(
         onwards: the motion into each further keyframe, and the gains [S, N] of its view, None if it shows
             nothing.
     """
-    poses, covariances, gained = [at.pose], [at.covariance], [0.0]
+    poses, gained = [at.pose], [0.0]
     total, inside = 0.0, True
     for moved, gains in onwards:
         at, gain = advance(ground, at, moved, gains)
         log_odds, inside = keyframe_odds(ground, odds, at.pose, gain, inside)
         poses.append(at.pose)
-        covariances.append(at.covariance)
         gained.append(log_odds)
         total += log_odds
         if total < least:
             break
-    return Path(np.array(poses), np.array(covariances), np.array(gained))
+    return Path(np.array(poses), np.array(gained))
 
 
 def keyframe_odds(
@@ -159,7 +157,7 @@ class SessionViews(Checkpointed):
 
     def forget(self, keep: int) -> None:
         """Forgets all but the newest keyframes."""
-        for array in (self.gain, self.shows, self.motion, self.variance):
+        for array in self._growable_arrays().values():
             array.replace(array.rows[max(len(array.rows) - keep, 0) :].copy())
 
     def moved(self, k: int) -> Motion:
@@ -240,7 +238,7 @@ class Hypotheses(Checkpointed):
         if same_pose(ground, self.pose.rows, pose).any():
             return
         at = PoseHypothesis(pose, np.diag(ground.variance))
-        self._add_likely(at, float(views.follow_back(ground, odds, at, MIN_LOG_ODDS).odds.sum()))
+        self.add(at, float(views.follow_back(ground, odds, at, MIN_LOG_ODDS).odds.sum()))
 
     def continue_uncertain(self, ground: Ground, odds: GainOdds, recalled: Recalled) -> None:
         """Adds the recalled pose if it continues another one, which odometry has made uncertain: with the
@@ -256,14 +254,13 @@ class Hypotheses(Checkpointed):
         if len(same):
             self.log_odds.rows[same] = np.maximum(self.log_odds.rows[same], log_odds)
         else:
-            self._add_likely(PoseHypothesis(pose, np.diag(ground.variance)), log_odds)
-
-    def _add_likely(self, at: PoseHypothesis, log_odds: float) -> None:
-        if log_odds >= MIN_LOG_ODDS:
-            self.add(at, log_odds)
+            self.add(PoseHypothesis(pose, np.diag(ground.variance)), log_odds)
 
     def add(self, at: PoseHypothesis, log_odds: float) -> None:
-        """Adds a pose hypothesis of the newest keyframe with the log-odds of the session so far."""
+        """Adds a pose hypothesis of the newest keyframe with the log-odds of the session so far, unless these
+        are too low."""
+        if log_odds < MIN_LOG_ODDS:
+            return
         self.pose.append(at.pose)
         self.covariance.append(at.covariance)
         self.log_odds.append(log_odds)
@@ -284,7 +281,7 @@ class Hypotheses(Checkpointed):
         return np.argsort(-self.log_odds.rows, kind="stable")
 
     def _keep(self, rows: np.ndarray) -> None:
-        for array in (self.pose, self.covariance, self.log_odds, self.states, self.best, self.inside):
+        for array in self._growable_arrays().values():
             array.replace(array.rows[rows].copy())
 
 

@@ -120,15 +120,15 @@ class Traverse(NamedTuple):
         """The path of the piece at poses [n, 3] as a rigid body, corrected by the views."""
         loose = np.diag(ground.variance)
         at, inside, unconfirmed = PoseHypothesis(rigid[0], loose), False, UNCONFIRMED
-        poses, covariances, gained = np.empty_like(rigid), np.empty((len(rigid), 3, 3)), np.zeros(len(rigid))
+        poses, gained = np.empty_like(rigid), np.zeros(len(rigid))
         for k, motion in enumerate(self.motions):
             if unconfirmed >= UNCONFIRMED:
                 at, motion = PoseHypothesis(rigid[k], loose), NO_MOTION
             at, gain = advance(ground, at, motion, self.views.gains(k))
             gained[k], inside = keyframe_odds(ground, odds, at.pose, gain, inside)
-            poses[k], covariances[k] = at
+            poses[k] = at.pose
             unconfirmed = 0 if gained[k] > 0 else unconfirmed + 1
-        return Path(poses, covariances, gained)
+        return Path(poses, gained)
 
 
 def _largest_rigid_part(ground: Ground, own: np.ndarray, found: np.ndarray) -> np.ndarray:
