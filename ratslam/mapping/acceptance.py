@@ -155,6 +155,11 @@ def _belief(
     return kept, mean, max(float(np.hypot(sd, mean - kept)), least_sd)
 
 
+_Vote = tuple[np.ndarray, np.ndarray, CalibrationPrior, CalibrationPrior, np.ndarray]
+"""The R sequences [R] that were compared with odometry, their log odds by score [R], and their vote on the
+calibration (`vote`)."""
+
+
 class AcceptByOdds(Acceptance):
     """Judges all open sequences. Odometry is compared on the keyframes as they were taken, of `archive`
     once some are merged."""
@@ -192,11 +197,10 @@ class AcceptByOdds(Acceptance):
         voted = self._vote(graph, log)
         graph.adopt_prior(log, voted[2])
         among = np.arange(log.sequences) if due else np.array([sequence])
-        return self._accept(graph, log, among, *voted[:2], voted[-1]) or self._break(graph, log, sequence)
+        return self._accept(graph, log, among, voted) or self._break(graph, log, sequence)
 
     def review(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
-        sequences, score_odds, _, _, odds = self._vote(graph, log)
-        return self._accept(graph, log, np.arange(log.sequences), sequences, score_odds, odds)
+        return self._accept(graph, log, np.arange(log.sequences), self._vote(graph, log))
 
     def solution(self, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
         graph, log = graph.copy(), log.copy()
@@ -216,11 +220,7 @@ class AcceptByOdds(Acceptance):
         super().restore(arrays)
         self._scan.clear()
 
-    def _vote(
-        self, graph: KeyframeGraph, log: ClosureLog
-    ) -> tuple[np.ndarray, np.ndarray, CalibrationPrior, CalibrationPrior, np.ndarray]:
-        """The R sequences [R] that were compared with odometry, their log odds by score [R], and their vote
-        on the calibration (`vote`)."""
+    def _vote(self, graph: KeyframeGraph, log: ClosureLog) -> _Vote:
         near = self._scan.near(self._views_prior)
         known = np.isfinite(self._log_ratio.rows[:, near]).all(axis=1)
         sequences = np.flatnonzero(known & (log.verdicts()[: len(known)] != Verdict.UNDONE))
@@ -232,21 +232,10 @@ class AcceptByOdds(Acceptance):
         grid, ratios = self._scan.grid[near], self._log_ratio.rows[sequences][:, near]
         return sequences, score_odds, *vote(grid, self._views_prior, ratios, score_odds, least)
 
-    def _accept(
-        self,
-        graph: KeyframeGraph,
-        log: ClosureLog,
-        among: np.ndarray,
-        sequences: np.ndarray,
-        score_odds: np.ndarray,
-        odds: np.ndarray,
-    ) -> bool:
+    def _accept(self, graph: KeyframeGraph, log: ClosureLog, among: np.ndarray, voted: _Vote) -> bool:
         """Accepts every open sequence of `among` whose odds, by raw odometry or by the map, are high
-        enough; whether there was any.
-
-        Args:
-            sequences, score_odds, odds: see `_vote`.
-        """
+        enough; whether there was any."""
+        sequences, score_odds, _, _, odds = voted
         open_ = (log.verdicts()[sequences] == Verdict.OPEN) & np.isin(sequences, among)
         open_ &= ((log.left() > 0) & ~spans(graph.pieces(log), log))[sequences]
         # No odometry prior at the start of a piece: only the map judges there.

@@ -377,7 +377,7 @@ class KeyframeMap(Checkpointed, Map):
         """Takes up a finished selection and begins the next, ties the newest piece, judges the map."""
         graph, log = self._graph, self.log
         if self.selection.finish(graph, log):
-            self.merger.note_selection(graph)
+            self.merger.merge_due = self.config.merge_stood > 0
             self._forget_solution()
         self.selection.begin(graph, log)
         self.merger.select(graph, log)
@@ -387,7 +387,7 @@ class KeyframeMap(Checkpointed, Map):
             self._doubt = worse_than_odometry(graph, MapSolution(graph.fit(), log, graph.cut))
             if not self.config.select_every:  # sequences are then confirmed by each judgement instead
                 log.count_selection()
-                self.merger.note_selection(graph)
+                self.merger.merge_due = self.config.merge_stood > 0
 
     def _tie_newest_piece(self, find: FindTie) -> bool:
         """If a trial is due: ties the newest piece where the evidence suffices, or undoes its tie where the

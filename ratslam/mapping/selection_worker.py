@@ -144,11 +144,6 @@ class SelectionWorker(Checkpointed):
         self.job = DelayedJob(THREAD, lambda: SelectedMap(ClosureLog(), MapHypotheses()))
         self.hypotheses = MapHypotheses()
 
-    @property
-    def busy(self) -> bool:
-        """Whether a selection is in progress."""
-        return self.job.busy
-
     def begin(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Begins a selection if it is due."""
         if self._every and graph.total % self._every == 0:
