@@ -230,7 +230,7 @@ EVEN = GainOdds(np.arange(BINS - 1.0), np.zeros(BINS), 0.0)
 def view_fits(graph: KeyframeGraph) -> np.ndarray:
     """[N, S, N] float32 log-odds that the view of a keyframe (first axis) is one of the place of another
     (last axis), facing alike and, with whiskers, opposite; -inf for those of nearly the same time."""
-    count, shifts = graph.count, 2 if np.cos(graph.sector_angle) < 0 else 1
+    count, shifts = graph.count, 1 + graph.half_turns
     fits = np.empty((count, shifts, count), np.float32)
     every, reversed = np.tile(np.arange(count), shifts), np.repeat(np.arange(shifts) > 0, count)
     for frame in range(count):

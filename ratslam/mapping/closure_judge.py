@@ -208,15 +208,11 @@ def _fit_elsewhere(graph: KeyframeGraph, frames: np.ndarray) -> np.ndarray:
     others = np.unique(np.linspace(0, graph.count - 1, CONTROLS).astype(int))
     shape = len(frames), len(others)
     row, control = (each.ravel() for each in np.indices(shape))
-    reversed = (control % 2 > 0) & _sees_half_turns(graph)
+    reversed = (control % 2 > 0) & graph.half_turns
     odds = graph.log_odds(frames[row], others[control], reversed).reshape(shape)
     away = np.abs(others - frames[:, None]) > graph.guard
     mean = np.where(away, np.exp(odds), 0.0).sum(axis=1) / np.maximum(away.sum(axis=1), 1)
     return np.where(mean > 0, np.log(np.where(mean > 0, mean, 1.0)), 0.0)
-
-
-def _sees_half_turns(graph: KeyframeGraph) -> bool:
-    return bool(np.cos(graph.sector_angle) < 0)
 
 
 def _count_views(
@@ -235,7 +231,7 @@ def _count_views(
             `_fit_elsewhere`.
     """
     start = ground[way.match - begins] + [0.0, 0.0, way.turn]
-    reach, turns = REACH * graph.cell, np.arange(1 + _sees_half_turns(graph)) * np.pi
+    reach, turns = REACH * graph.cell, np.arange(1 + graph.half_turns) * np.pi
     middle, lag = way.middle - way.low, way.low - begins
     ahead = integrate(motion[middle + 1 :], start)
     back = integrate(inverse(motion[middle:0:-1]), start)[::-1]

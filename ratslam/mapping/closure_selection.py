@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed
+from ratslam.mapping.keyframe_graph import Place
 from ratslam.mapping.merging import Merge
 from ratslam.mapping.optimizer import LoopClosures, MapFit, MapProblem, System
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
@@ -38,10 +39,6 @@ COST_TOLERANCE = 0.5
 """Difference in cost, chi-square, below which two cuts count as equally good."""
 
 
-ViewsCost = Callable[[np.ndarray], float]
-"""What the views say against poses [N, 3] of the keyframes, chi-square."""
-
-
 class SelectionProblem(NamedTuple):
     """The sequences to select from, and the odometry.
 
@@ -57,8 +54,8 @@ class SelectionProblem(NamedTuple):
     evidence: np.ndarray
     first: np.ndarray
     last: np.ndarray
-    views_cost: ViewsCost
-    place: Callable[[np.ndarray], np.ndarray] = np.copy
+    views_cost: Callable[[np.ndarray], float]
+    place: Place = np.copy
 
 
 class Selection(NamedTuple):

@@ -97,6 +97,11 @@ class KeyframeGraph(Checkpointed):
         """Turn per sector shift of a view, rad; 0 while unknown."""
         return self.appearance.metric().angle
 
+    @property
+    def half_turns(self) -> bool:
+        """Whether views turned by half a turn are compared too, as those of whiskers."""
+        return bool(np.cos(self.sector_angle) < 0)
+
     def copy(self) -> KeyframeGraph:
         """A copy of the present state, which may change independently."""
         other = copy(self)

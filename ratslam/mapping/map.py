@@ -39,7 +39,7 @@ from ratslam.mapping.map_solution import (
 from ratslam.mapping.odometry_calibration import calibration_from_views, write_calibration
 from ratslam.mapping.pose_graph import Edges, write_g2o, write_json
 from ratslam.mapping.selection_worker import SelectionWorker
-from ratslam.mapping.step_record import NO_TRAVEL, LiveFilter, StepRecord, Travel, leading_to
+from ratslam.mapping.step_record import NO_TRAVEL, LiveFilter, StepRecord, leading_to
 from ratslam.mapping.verification import continues_sequence, has_same_heading, spans
 from ratslam.recall.memory import MapFeedback, MergedRows
 from tactile.base.types import Observation
@@ -84,10 +84,11 @@ class KeyframeMap(Checkpointed, Map):
     Attributes:
         log: candidates and sequences of the keyframes that are not merged.
         archive, appearance: of all keyframes ever taken.
+        travel: the motion since the newest keyframe.
         merger, selection: merge keyframes and select closures beside the session.
     """
 
-    VALUES = ("_travel", "_since", "_turned", "_begins", "_solved", "_doubt")
+    VALUES = ("travel", "_since", "_turned", "_begins", "_solved", "_doubt")
     PARTS = (
         "_graph", "log", "_steps", "archive", "merger", "_experiences", "appearance", "_acceptance",
         "_live", "selection", "_tie_odds",
@@ -115,7 +116,7 @@ class KeyframeMap(Checkpointed, Map):
         self._acceptance, self._find_tie = acceptance(self._graph, self.archive), find_tie
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._live, self._steps, self._tie_odds = LiveFilter(), StepRecord(), LearnedOdds()
-        self._travel = NO_TRAVEL
+        self.travel = NO_TRAVEL
         self._since, self._turned = 0.0, 0.0  # distance (m) and turns (rad) since the last closure
         self._begins = False  # the next keyframe begins a piece
         self._solved = (-1, -1)  # sequence and number of the keyframe of the last optimisation
@@ -135,7 +136,7 @@ class KeyframeMap(Checkpointed, Map):
         a bias that only views show may be wrong."""
         del estimate
         confirmed = (self.log.verdicts() == Verdict.ACCEPTED).any()
-        graph, (motion, length, _) = self._graph, self._travel
+        graph, (motion, length, _) = self._graph, self.travel
         if confirmed:
             return graph.pose_after(motion, length)
         reckoned = self._steps.odometry[-1:]
@@ -268,16 +269,11 @@ class KeyframeMap(Checkpointed, Map):
         """[N] the step at which each keyframe was taken."""
         return self._steps.first_steps(self._graph.total)
 
-    @property
-    def travel(self) -> Travel:
-        """The motion since the newest keyframe."""
-        return self._travel
-
     def begin_piece(self) -> None:
         """The next keyframe begins a piece; steps until then lead to it."""
         self._steps.settle(self._graph.total)
         self._begins = self._graph.count > 0
-        self._travel = NO_TRAVEL
+        self.travel = NO_TRAVEL
         self._since = self._turned = 0.0
 
     def merge(self) -> MergedRows | None:
@@ -289,7 +285,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
         """Moves by the odometry; a view that became a keyframe is added, judged and given an experience."""
-        graph, self._travel = self._graph, self._travel.onwards(observation.odometry)
+        graph, self.travel = self._graph, self.travel.onwards(observation.odometry)
         place = previous = self._experiences.current
         action = Action.NONE
         if int(evidence.keyframe) >= 0:
@@ -313,7 +309,7 @@ class KeyframeMap(Checkpointed, Map):
         moved = np.array(observation.odometry[:3], float)
         moved = graph.calibrated(moved, float(np.hypot(*moved[:2])))
         frame = leading_to(count) if self._begins or not count else count - 1
-        self._steps.append(frame, self._travel, moved if np.isfinite(moved).all() else np.zeros(3))
+        self._steps.append(frame, self.travel, moved if np.isfinite(moved).all() else np.zeros(3))
         self._forget_solution()
         return estimate._replace(place=place, previous=previous, action=action)
 
@@ -330,9 +326,9 @@ class KeyframeMap(Checkpointed, Map):
         self._optimise()
 
     def _append(self, observation: Observation) -> None:
-        motion, length, turn = self._travel
+        motion, length, turn = self.travel
         if self._begins or not self._graph.count:
-            self._steps.arrive(self._graph.total, self._travel)
+            self._steps.arrive(self._graph.total, self.travel)
         if self._begins:
             self._graph.begin_piece()
             motion, length, turn = NO_TRAVEL
@@ -341,7 +337,7 @@ class KeyframeMap(Checkpointed, Map):
         self.archive.append(self._graph)
         self._live.advance(self._graph)
         self._since, self._turned = self._since + length, self._turned + turn
-        self._travel, self._begins = NO_TRAVEL, False
+        self.travel, self._begins = NO_TRAVEL, False
         self.appearance.append(observation, motion[2], length)
 
     def _judge_candidate(self, evidence: Evidence) -> int:

@@ -78,8 +78,7 @@ def claimed_revisits(
     first, count = graph.guard + 1, len(poses)
     frames = np.unique(np.linspace(first, count - 1, max(min(count - first, most), 0)).astype(int))
     facing = near_facing(poses, frames, graph.guard, RADIUS * graph.cell, FACING)
-    whiskers = np.cos(graph.sector_angle) < 0  # views turned by half a turn are compared too
-    row, near = np.nonzero(facing if whiskers else facing > 0)
+    row, near = np.nonzero(facing if graph.half_turns else facing > 0)
     frame, reversed = frames[row], facing[row, near] < 0
     if not len(frame):
         return frame, near, np.zeros(0), len(frames)

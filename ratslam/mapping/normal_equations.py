@@ -49,26 +49,15 @@ class BlockPattern:
         """
         layout = self._layout
         regular, blocks, inverse, logarithm = factorise(self.start, self.row, diagonal, above, layout)
-        return _BlockFactor(*layout[:2], blocks, inverse, float(logarithm)) if regular else None
+        return _BlockFactor((*layout[:2], blocks, inverse), float(logarithm)) if regular else None
 
 
 class _BlockFactor:
-    """The factor L D L^T of a matrix.
+    """The factor L D L^T of a matrix: where its blocks stand, the blocks, the inverses of D; and the natural
+    logarithm of the determinant of the matrix."""
 
-    Attributes:
-        log_determinant: natural logarithm of the determinant of the matrix.
-    """
-
-    def __init__(
-        self,
-        first: np.ndarray,
-        rows: np.ndarray,
-        blocks: np.ndarray,
-        inverse: np.ndarray,
-        log_determinant: float,
-    ) -> None:
-        self._parts = first, rows, blocks, inverse
-        self.log_determinant = log_determinant
+    def __init__(self, parts: tuple[np.ndarray, ...], log_determinant: float) -> None:
+        self._parts, self.log_determinant = parts, log_determinant
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """[n, 3, C] the solutions for the right-hand sides [n, 3, C], in the order of elimination."""

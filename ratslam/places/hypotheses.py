@@ -34,10 +34,17 @@ BESIDE_SHARE = 0.3
 
 class Path(NamedTuple):
     """A pose hypothesis followed through n keyframes: poses [n, 3], m, m, rad, and log-odds [n] of each
-    keyframe, nat."""
+    keyframe, nat; `first`: the number of the first one in its session."""
 
     poses: np.ndarray
     odds: np.ndarray
+    first: int = 0
+
+    def passes(self, ground: Ground, k: int, pose: np.ndarray) -> bool:
+        """Whether keyframe k of the session is at `pose` [3]."""
+        row = k - self.first
+        inside = 0 <= row < len(self.poses)
+        return inside and bool(same_pose(ground, self.poses[row : row + 1], pose)[0])
 
     def odds_beside(self, ground: Ground) -> np.ndarray:
         """[n] the log-odds of each keyframe, nat; of those in a run beside the driven way, less after the

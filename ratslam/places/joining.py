@@ -247,7 +247,7 @@ def _closures(graph: KeyframeGraph, views: MapViews, found: _Found) -> list[list
         if frame < other:
             frame, other, turn = other, frame, -turn
         shift = round(-turn / angle) if angle else 0
-        if np.cos(angle) < 0:  # half a turn is the same either way
+        if graph.half_turns:  # half a turn is the same either way
             shift = abs(shift)
         posterior = float(1 / (1 + np.exp(-match.gain)))
         sequences[-1].append(Candidate(frame, other, shift, posterior, match.gain))

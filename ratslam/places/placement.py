@@ -96,7 +96,7 @@ class Traverse(NamedTuple):
     least: float = MIN_LOG_ODDS
     solved: np.ndarray | None = None
 
-    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
+    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Path:
         """The path with keyframe k at `pose` [3], to both ends of the session while it is likely enough; of a
         solved piece, if many places agree on one motion, that of the whole piece as a rigid body."""
         at = PoseHypothesis(pose, np.diag(ground.variance))
@@ -105,16 +105,18 @@ class Traverse(NamedTuple):
         before = follow(ground, odds, at, back, self.least)
         onwards = ((motions[i], views.gains(i)) for i in range(k + 1, len(motions)))
         after = follow(ground, odds, at, onwards, self.least)
-        parts = (np.concatenate([one[:0:-1], other]) for one, other in zip(before, after, strict=True))
-        first, path = k + 1 - len(before.poses), Path(*parts)
+        poses, gained = (
+            np.concatenate([one[:0:-1], other]) for one, other in zip(before[:2], after[:2], strict=True)
+        )
+        path = Path(poses, gained, k + 1 - len(before.poses))
         if self.solved is not None:
             confirmed = np.flatnonzero(path.odds > 0)
-            own, found = self.solved[first + confirmed], path.poses[confirmed]
+            own, found = self.solved[path.first + confirmed], path.poses[confirmed]
             together = _largest_rigid_part(ground, own, found)
             if together.sum() >= TOGETHER:
                 moved = fit_rigid_motion(own[together], found[together])
-                return Stretch(0, self._along(ground, odds, compose(moved, self.solved)))
-        return Stretch(first, path)
+                return self._along(ground, odds, compose(moved, self.solved))
+        return path
 
     def _along(self, ground: Ground, odds: GainOdds, rigid: np.ndarray) -> Path:
         """The path of the piece at poses [n, 3] as a rigid body, corrected by the views."""
@@ -144,19 +146,6 @@ def _largest_rigid_part(ground: Ground, own: np.ndarray, found: np.ndarray) -> n
     return best
 
 
-class Stretch(NamedTuple):
-    """The path over consecutive keyframes of a session, from keyframe `first` on."""
-
-    first: int
-    path: Path
-
-    def passes(self, ground: Ground, k: int, pose: np.ndarray) -> bool:
-        """Whether keyframe k of the session is at `pose` [3]."""
-        row = k - self.first
-        inside = 0 <= row < len(self.path.poses)
-        return inside and bool(same_pose(ground, self.path.poses[row : row + 1], pose)[0])
-
-
 def find_placements(ground: Ground, odds: GainOdds, session: Traverse) -> list[Path]:
     """The different placements of a session that recall proposes and that remain likely to both its ends.
 
@@ -172,17 +161,17 @@ def find_placements(ground: Ground, odds: GainOdds, session: Traverse) -> list[P
         paths over all keyframes of the session, those with the largest log-odds first; of two that are
         together at most keyframes, the first one found.
     """
-    tried: list[Stretch] = []
+    tried: list[Path] = []
     found: list[Path] = []
     views, newest = session.views, NOTHING_RECALLED
     for k, moved in enumerate(session.motions):
         claim = int(views.shift[k]), int(views.match[k])
         newest = newest.onwards(ground, moved, *claim, float(views.posterior[k]))
         pose = newest.pose
-        if not newest.is_confirmed or any(stretch.passes(ground, k, pose) for stretch in tried):
+        if not newest.is_confirmed or any(path.passes(ground, k, pose) for path in tried):
             continue
-        tried.append(session.follow(ground, odds, k, pose))
-        path = tried[-1].path
+        path = session.follow(ground, odds, k, pose)
+        tried.append(path)
         if len(path.poses) < len(session.motions):
             continue
         for other in found:
