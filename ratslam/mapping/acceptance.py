@@ -1,12 +1,11 @@
 """Rules by which a map accepts closure sequences: by evidence (whiskers), by odds (views, ids).
 
-The odds of a sequence are those of its score among the false sequences of this session (the null), times
-the likelihood ratio of its place under raw odometry (`OdometryScan`), with the calibration for which the
-other sequences vote; or under the map, where its covariance is narrow enough to be linear. Nobody says
-which sequences are false: each counts as false by the probability that it is, as judged last. A sequence of
-score s is then true with odds (T e^(-s/m) / m) / (n e^(-(s - s0)/t) / t), with n false sequences above s0
-and their mean excess t: one step of expectation maximisation (Dempster, Laird & Rubin 1977) of a mixture
-each time.
+The odds of a sequence are those of its score among the false sequences of this session (the null), times the
+likelihood ratio of its place under raw odometry (`OdometryScan`), with the calibration for which the other
+sequences vote; or under the map, where its covariance is narrow enough to be linear. Nobody says which
+sequences are false: each counts as false by the probability that it is, as judged last. A sequence of score s
+is then true with odds (T e^(-s/m) / m) / (n e^(-(s - s0)/t) / t), with n false sequences above s0 and their
+mean excess t: one step of expectation maximisation (Dempster, Laird & Rubin 1977) of a mixture each time.
 
 The vote on the calibration is held before any sequence is accepted: a true sequence favours the heading
 biases and turn errors with which odometry leads to its place, a false one none that others favour as well.

@@ -1,5 +1,4 @@
-"""Merging of keyframes during a session, and the archive of all keyframes and candidates as they were
-taken.
+"""Merging of keyframes during a session, and the archive of all keyframes and candidates as they were taken.
 
 A merge takes for granted that its ground is right, and what the map solves for afterwards cannot show that
 it was wrong, because merged keyframes move together. So each time the keyframes have doubled, all closure
@@ -91,8 +90,7 @@ class Archive(Checkpointed):
         return np.concatenate([self.pairs.rows, _confirmed_pairs(graph, log)])
 
     def poses(self, poses: np.ndarray) -> np.ndarray:
-        """[E, 3] poses of all keyframes by those of the map's keyframes [N, 3]; the same before any
-        merge."""
+        """[E, 3] poses of all keyframes by those of the map's keyframes [N, 3]; the same before any merge."""
         return compose(poses[self.row.rows], self.offset.rows) if self.begun else poses
 
     def follow(self, solution: MapSolution, graph: KeyframeGraph) -> MapSolution:

@@ -81,8 +81,7 @@ sequences of recall and those along the poses; and the sequences of recall alone
 
 
 def is_retraced(graph: KeyframeGraph) -> bool:
-    """Whether the final map of these keyframes, none of them merged, is retraced: not if pieces are
-    given."""
+    """Whether the final map of these keyframes, none of them merged, is retraced: not if pieces are given."""
     config = graph.config
     known = FEWEST_RETRACED <= graph.count <= MOST_RETRACED and not graph.begins.rows.any()
     return bool(config.may_be_carried and config.select_every and known)

@@ -130,8 +130,7 @@ def select_closures_and_cuts(
 
 def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
     """[R] squared deviation between the start of each sequence and the odometry since the last accepted
-    closure. Both poses are those of the closures alone, so that a map deformed by a jump does not hide
-    it."""
+    closure. Both poses are those of the closures alone, so that a map deformed by a jump does not hide it."""
     chain, closures, *_ = case.measurements.cut_at([frame for frame, _ in best.cuts])
     strain = np.zeros(len(case.evidence))
     for sequence in range(len(strain)):

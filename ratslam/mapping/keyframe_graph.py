@@ -124,11 +124,9 @@ class KeyframeGraph(Checkpointed):
 
     def append_newest(self, other: KeyframeGraph) -> None:
         """Adds the newest keyframe of another graph."""
-        pose, motion, length, turn, begins = (
-            array.rows[-1] for array in (other.pose, other.motion, other.length, other.turn, other.begins)
-        )
+        for name, array in self._growable_arrays().items():
+            array.append(getattr(other, name).rows[-1])
         self.reckoned = other.reckoned
-        self._append(pose, motion, length, turn, begins=bool(begins))
 
     def next_start(self) -> np.ndarray:
         """[3] the pose of the next keyframe if it begins a piece."""
@@ -236,8 +234,7 @@ class KeyframeGraph(Checkpointed):
         return MapFit(self.pose.rows, self.bias, np.zeros(0), self.turn_error)
 
     def odometry(self, cut: GrowableArray) -> OdometryChain:
-        """The odometry between keyframes with its variances, loose at the breaks `cut` and between
-        pieces."""
+        """The odometry between keyframes with its variances, loose at the breaks `cut` and between pieces."""
         return OdometryChain(self.motion.rows[1:], self.length.rows[1:], self.variances(cut)[1:])
 
     def variances(self, cut: GrowableArray) -> np.ndarray:
@@ -252,8 +249,7 @@ class KeyframeGraph(Checkpointed):
         return (cut.rows >= 0) | self.begins.rows
 
     def own_variances(self) -> np.ndarray:
-        """[N, 3] variances of the odometry into each keyframe without breaks, as if no noise were
-        learned."""
+        """[N, 3] variances of the odometry into each keyframe without breaks, as if no noise were learned."""
         learned = np.array([1.0, 1.0, self.heading_noise.factor])
         return self.odometry_variance(self.length.rows, self.turn.rows) / learned
 

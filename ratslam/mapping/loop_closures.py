@@ -1,12 +1,12 @@
 """Loop closures: candidates of recall in sequences that are accepted or refused as a whole.
 
-A single candidate is never accepted. Consecutive candidates that agree with the odometry form a sequence.
-The map accepts a sequence, refuses it, or removes it later; every candidate stays in the log with its
-evidence.
+A single candidate is never accepted. Consecutive candidates that agree with the odometry form a sequence. The
+map accepts a sequence, refuses it, or removes it later; every candidate stays in the log with its evidence.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import deepcopy
 from enum import IntEnum
 from pathlib import Path
@@ -105,6 +105,11 @@ class ClosureLog(Checkpointed):
         self._lines = None
         return self.sequences - 1
 
+    def add_accepted(self, candidates: Iterable[Candidate]) -> None:
+        """Adds the candidates of one sequence, which is accepted."""
+        for k, candidate in enumerate(candidates):
+            self.judge(self.add(candidate, k > 0), Verdict.ACCEPTED)
+
     def members(self, sequence: int) -> np.ndarray:
         """[n, 4] keyframe, match, shift, sequence of the candidates of one sequence."""
         rows = self._candidate.rows[self._among(sequence)]
@@ -159,8 +164,7 @@ class ClosureLog(Checkpointed):
         self._stood.rows[:] = np.where(strong, self._stood.rows + 1, 0)
 
     def confirm(self, times: int) -> None:
-        """Lets the sequences with a confirming weight count as confirmed by at least that many
-        selections."""
+        """Lets the sequences with a confirming weight count as confirmed by at least that many selections."""
         strong = (self._verdict.rows == Verdict.ACCEPTED) & (self._weight.rows > CONFIRMED_WEIGHT)
         self._stood.rows[strong] = np.maximum(self._stood.rows[strong], times)
 
@@ -293,8 +297,7 @@ class ClosureLog(Checkpointed):
         return self._candidate.rows[self.accepted_rows(), :2]
 
     def judged(self) -> np.ndarray:
-        """[n, 3] match, keyframe, and 1 where accepted, 0 where open, -1 where removed, of all
-        candidates."""
+        """[n, 3] match, keyframe, and 1 where accepted, 0 where open, -1 where removed, of all candidates."""
         sign = np.where(
             self._candidate.rows[:, 3] < 0, -1, SIGNS[self._verdict.rows[self._candidate.rows[:, 3]]]
         )

@@ -112,7 +112,7 @@ class KeyframeMap(Checkpointed, Map):
         self.log = ClosureLog()
         self.archive = Archive(KeyframeGraph(config, cell, appearance, guard, ablation))
         self.merger = KeyframeMerger(self.archive)
-        self.selection = SelectionWorker(config.select_every)
+        self.selection = SelectionWorker()
         self._acceptance, self._find_tie = acceptance(self._graph, self.archive), find_tie
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._live, self._steps, self._tie_odds = LiveFilter(), StepRecord(), LearnedOdds()
@@ -313,6 +313,12 @@ class KeyframeMap(Checkpointed, Map):
         self._forget_solution()
         return estimate._replace(place=place, previous=previous, action=action)
 
+    def add_accepted(self, candidates: Sequence[Candidate]) -> None:
+        """Adds the candidates of one sequence, which is accepted; the map is not optimised."""
+        self.log.add_accepted(candidates)
+        for k, candidate in enumerate(candidates):
+            self.archive.add(candidate, k > 0, self._graph)
+
     def undo(self, sequence: int) -> None:
         """Removes the closures of a sequence and optimises without them.
 
@@ -399,10 +405,7 @@ class KeyframeMap(Checkpointed, Map):
         if not len(across):
             if log_odds < self.config.tie_log_odds:
                 return False
-            for k, candidate in enumerate(closures):
-                sequence = log.add(candidate, k > 0)
-                self.archive.add(candidate, k > 0, graph)
-                log.judge(sequence, Verdict.ACCEPTED)
+            self.add_accepted(closures)
         elif log_odds >= self.config.tie_log_odds / 2:
             return False
         for sequence in across.tolist():

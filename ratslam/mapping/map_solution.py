@@ -200,9 +200,8 @@ def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[Calibra
 
 
 def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypotheses) -> MapSolution | None:
-    """The map with the closure sequences that are best accepted together; None if none has the evidence of
-    an accepted one: weak sequences count only beside it, as images without information give a few of
-    them."""
+    """The map with the closure sequences that are best accepted together; None if none has the evidence of an
+    accepted one: weak sequences count only beside it, as images without information give a few of them."""
     config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
     candidates = sequences_to_select(graph, log)
     if not (candidates & (log.scores() >= config.min_score)).any():

@@ -1,11 +1,10 @@
 """The normal equations of the keyframes' poses and of the odometry's calibration, and their factorisation.
 
 The matrix of the poses is symmetric positive definite, with 3 x 3 blocks for the nodes (x, y, heading) and
-for the edges between them. It is factorised as L D L^T, up-looking, by blocks (Davis 2005, ACM TOMS 849);
-the order of elimination (minimum degree) and the sparsity of the factor are computed once for a graph. The
-calibration, one or two dense columns, is the border of the matrix and is solved for by its Schur
-complement. Keyframe 0 is fixed: nodes without a number among the unknowns, position -1, add nothing to the
-equations.
+for the edges between them. It is factorised as L D L^T, up-looking, by blocks (Davis 2005, ACM TOMS 849); the
+order of elimination (minimum degree) and the sparsity of the factor are computed once for a graph. The
+calibration, one or two dense columns, is the border of the matrix and is solved for by its Schur complement.
+Keyframe 0 is fixed: nodes without a number among the unknowns, position -1, add nothing to the equations.
 """
 
 from __future__ import annotations
@@ -237,27 +236,13 @@ def _solve_in_place(
 PI = float(np.pi)
 
 
-class Measurements(NamedTuple):
-    """M relative poses of keyframes and what is known of them.
-
-    Attributes:
-        i, j: [M] keyframes. motion: [M, 3] measured pose of keyframe j in the frame of keyframe i (m, m,
-            rad). information: [M, 3] of it. regressors: [M, 2] distance (m) and turn (rad) by which heading
-            bias and turn error bend each measurement, 0 for closures.
-        at_i, at_j: [M] position of the keyframes in the order of elimination, -1 for keyframe 0.
-        slot: [M] block above the diagonal, -1 for edges of keyframe 0.
-    """
-
-    i: np.ndarray
-    j: np.ndarray
-    motion: np.ndarray
-    information: np.ndarray
-    regressors: np.ndarray
-    at_i: np.ndarray
-    at_j: np.ndarray
-    slot: np.ndarray
-
-
+Measurements = tuple[
+    np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray
+]
+"""M relative poses of keyframes and what is known of them: keyframes i and j, [M] each; the measured pose
+[M, 3] of j in the frame of i (m, m, rad) and the information [M, 3] of it; distance (m) and turn (rad) [M, 2]
+by which heading bias and turn error bend it, 0 for closures; the positions [M] of i and of j in the order of
+elimination, -1 for keyframe 0; the block [M] above the diagonal, -1 for edges of keyframe 0."""
 Blocks = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """The equations of n poses and K calibration parameters: of the poses the blocks on the diagonal [n, 3, 3]
 and above it [B, 3, 3]; right-hand sides [n, 3, 1 + K], the negative gradient of the poses and the border
@@ -270,13 +255,14 @@ def measurement_errors(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The measurements [M, 3] without the systematic errors of the odometry, their errors [M, 3] (m, m,
     rad), and their chi-squares [M]."""
-    count = len(edges.i)
+    i, j, motion, information, regressors, _, _, _ = edges
+    count = len(i)
     measured, error, chi2 = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
     for m in range(count):
-        a, b = edges.i[m], edges.j[m]
-        turn = bias * edges.regressors[m, 0] + turn_error * edges.regressors[m, 1]
+        a, b = i[m], j[m]
+        turn = bias * regressors[m, 0] + turn_error * regressors[m, 1]
         c, s = np.cos(turn / 2), np.sin(turn / 2)
-        x, y, heading = edges.motion[m, 0], edges.motion[m, 1], edges.motion[m, 2]
+        x, y, heading = motion[m, 0], motion[m, 1], motion[m, 2]
         measured[m, 0], measured[m, 1] = c * x - s * y, s * x + c * y
         measured[m, 2] = PI - (PI - heading - turn) % (2 * PI)
         c, s = np.cos(poses[a, 2]), np.sin(poses[a, 2])
@@ -287,7 +273,7 @@ def measurement_errors(
         error[m, 2] = PI - (PI - turned) % (2 * PI)
         total = 0.0
         for r in range(3):
-            total += error[m, r] ** 2 * edges.information[m, r]
+            total += error[m, r] ** 2 * information[m, r]
         chi2[m] = total
     return measured, error, chi2
 
@@ -336,15 +322,16 @@ def add_measurements(
     by the pose of keyframe i, and [c s 0], [-s c 0], [0 0 1] by that of keyframe j. The products are
     written out, because loops over their many zeros take several times as long.
     """
+    i, _, _, information, regressors, place_i, place_j, slots = edges
     diagonal, above, right, corner, slope = blocks
     parameters = len(slope)
     for m in range(len(trust)):
-        heading, at_i, at_j, slot = poses[edges.i[m], 2], edges.at_i[m], edges.at_j[m], edges.slot[m]
+        heading, at_i, at_j, slot = poses[i[m], 2], place_i[m], place_j[m], slots[m]
         c, s = np.cos(heading), np.sin(heading)
         p, q = error[m, 1] + measured[m, 1], -error[m, 0] - measured[m, 0]
-        w0 = edges.information[m, 0] * trust[m]
-        w1 = edges.information[m, 1] * trust[m]
-        w2 = edges.information[m, 2] * trust[m]
+        w0 = information[m, 0] * trust[m]
+        w1 = information[m, 1] * trust[m]
+        w2 = information[m, 2] * trust[m]
         e0, e1, e2 = w0 * error[m, 0], w1 * error[m, 1], w2 * error[m, 2]  # weighted errors
         xx, xy, yy = w0 * c * c + w1 * s * s, (w0 - w1) * c * s, w0 * s * s + w1 * c * c
         xh, yh = w1 * s * q - w0 * c * p, -w0 * s * p - w1 * c * q
@@ -384,7 +371,7 @@ def add_measurements(
                 above[slot, 0, 2] -= xh
                 above[slot, 1, 2] -= yh
         for k in range(parameters):  # derivative d of the errors by the calibration, at its border
-            share = edges.regressors[m, k]
+            share = regressors[m, k]
             if share == 0.0:  # of closures
                 continue
             d0, d1, d2 = measured[m, 1] / 2 * share, -measured[m, 0] / 2 * share, -share
@@ -400,7 +387,7 @@ def add_measurements(
                 right[at_j, 2, 1 + k] += b2
             slope[k] += d0 * e0 + d1 * e1 + d2 * e2
             for other in range(parameters):
-                share = edges.regressors[m, other]
+                share = regressors[m, other]
                 corner[k, other] += (b0 * measured[m, 1] / 2 - b1 * measured[m, 0] / 2 - b2) * share
 
 

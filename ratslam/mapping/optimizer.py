@@ -1,5 +1,4 @@
-"""Robust SE(2) least squares over a chain of keyframes with closure sequences and the odometry's
-calibration.
+"""Robust SE(2) least squares over a chain of keyframes with closure sequences and the odometry's calibration.
 
 A constant turn of the odometry to one side, the heading bias (rad/m), and the share by which its turns are
 wrong, the turn error (rad/rad), are solved for with the poses. Each closure sequence has one robust weight,
@@ -21,7 +20,6 @@ import numpy as np
 from ratslam.mapping.normal_equations import (
     BlockPattern,
     Equations,
-    Measurements,
     add_measurements,
     measurement_errors,
     weigh_closures,
@@ -266,7 +264,7 @@ class System:
         spread = np.broadcast_to(closures.variance, (len(closures.i), 3))
         information = 1 / np.concatenate([chain.variance, links.variance, spread])
         regressors = np.column_stack([lengths, turns])
-        self._edges = Measurements(i, j, motion, information, regressors, at_i, at_j, slot)
+        self._edges = i, j, motion, information, regressors, at_i, at_j, slot
         limit = np.broadcast_to(np.asarray(closures.cost_limit, float), closures.scale.shape)
         self._closures = len(chain.length) + len(links.length), closures.sequence, closures.scale, limit
         self._parameters, self._problem = 1 + int(prior.turn_error_sd > 0), problem

@@ -231,8 +231,7 @@ no_kernel: Kernel = (np.ones_like, lambda chi2: chi2, np.zeros_like)
 
 
 def huber(scale: float) -> Kernel:
-    """Cost linear beyond `scale` standard deviations, so the influence of an edge is bounded (Huber
-    1964)."""
+    """Cost linear beyond `scale` standard deviations, so the influence of an edge is bounded (Huber 1964)."""
     return (
         lambda chi2: np.minimum(1.0, scale / np.sqrt(np.maximum(chi2, 1e-300))),
         lambda chi2: np.where(chi2 <= scale**2, chi2, 2 * scale * np.sqrt(chi2) - scale**2),
@@ -241,8 +240,7 @@ def huber(scale: float) -> Kernel:
 
 
 def geman_mcclure(mu: float) -> Kernel:
-    """Cost bounded by mu: an error far beyond sqrt(mu) standard deviations has no influence (Geman
-    1985)."""
+    """Cost bounded by mu: an error far beyond sqrt(mu) standard deviations has no influence (Geman 1985)."""
 
     def curvature(chi2: np.ndarray) -> np.ndarray:
         weight = (mu / (mu + chi2)) ** 2
@@ -262,8 +260,7 @@ class Termination(Enum):
 
 
 class Solution(NamedTuple):
-    """Poses [N, 3], reason for the end, number of steps, final cost, and robust weights [E] of the
-    edges."""
+    """Poses [N, 3], reason for the end, number of steps, final cost, and robust weights [E] of the edges."""
 
     poses: np.ndarray
     termination: Termination
@@ -351,9 +348,8 @@ def _evaluate(
 def growing_equations(count: int, edges: Edges, before: GraphEquations | None) -> GraphEquations | None:
     """The equations of a graph to which nodes and edges are added, None without edges.
 
-    The order of elimination is computed whenever the number of edges has grown by `GROWN`, from the edges
-    up to a number that follows from their number now: so a graph that was loaded is solved to the same
-    bits.
+    The order of elimination is computed whenever the number of edges has grown by `GROWN`, from the edges up
+    to a number that follows from their number now: so a graph that was loaded is solved to the same bits.
 
     Args:
         count: number of nodes. edges: those of the last call come first. before: what the last call gave.

@@ -1,9 +1,8 @@
 """Tracks: a pose hypothesis followed from keyframe to keyframe, and how well the views fit on the way.
 
-The keyframes of a map are the ground, and the same keyframes in order of time are the session that is
-placed on it; none is compared with keyframes of nearly the same time. The rule is that of
-`ratslam.mapping.ground` with variances of position and heading alone, in compiled loops, because hundreds
-of tracks are followed."""
+The keyframes of a map are the ground, and the same keyframes in order of time are the session that is placed
+on it; none is compared with keyframes of nearly the same time. The rule is that of `ratslam.mapping.ground`
+with variances of position and heading alone, in compiled loops, because hundreds of tracks are followed."""
 
 from __future__ import annotations
 

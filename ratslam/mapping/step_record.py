@@ -128,8 +128,7 @@ class StepRecord(Checkpointed):
 
 
 def settled(frame: np.ndarray, count: int) -> np.ndarray:
-    """[T] numbers of steps; those that lead to no keyframe of `count` taken ones have that of the
-    newest."""
+    """[T] numbers of steps; those that lead to no keyframe of `count` taken ones have that of the newest."""
     return np.where(frame <= leading_to(count), count - 1, frame)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from ratslam.mapping.closure_selection import MapHypotheses
 from ratslam.mapping.ground import Ground, Motion
 from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.mapping.loop_closures import Candidate, Verdict
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import MapSolution, selected_solution, solved_map
 from ratslam.mapping.optimizer import MapCovariance
@@ -150,7 +150,8 @@ def _join(map: KeyframeMap, views: MapViews, one: np.ndarray, other: np.ndarray)
     trial.pose.rows[other] = compose(found.motion, trial.pose.rows[other])
     # The map with these closures, selected together with all others where sequences are selected.
     first, selected = log.sequences, None
-    _add(log, sequences)
+    for sequence in sequences:
+        log.add_accepted(sequence)
     trial.optimise(log)
     if trial.config.select_every:
         hypotheses = MapHypotheses()
@@ -255,19 +256,10 @@ def _closures(graph: KeyframeGraph, views: MapViews, found: _Found) -> list[list
     return [sequence for sequence in sequences if len(sequence) >= graph.config.min_length]
 
 
-def _add(log: ClosureLog, sequences: list[list[Candidate]]) -> None:
-    for sequence in sequences:
-        for k, candidate in enumerate(sequence):
-            log.add(candidate, k > 0)
-        log.judge(log.sequences - 1, Verdict.ACCEPTED)
-
-
 def _take_up(map: KeyframeMap, solution: MapSolution, sequences: list[list[Candidate]]) -> None:
     graph, log = map.kept_keyframes(), map.log
     for sequence in sequences:
-        for k, candidate in enumerate(sequence):
-            map.archive.add(candidate, k > 0, graph)
-    _add(log, sequences)
+        map.add_accepted(sequence)
     log.follow(solution.log)
     graph.pose.rows[:] = solution.fit.poses
     graph.bias, graph.turn_error = solution.fit.bias, solution.fit.turn_error
