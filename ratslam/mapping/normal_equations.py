@@ -324,7 +324,6 @@ def add_measurements(
     """
     i, _, _, information, regressors, place_i, place_j, slots = edges
     diagonal, above, right, corner, slope = blocks
-    parameters = len(slope)
     for m in range(len(trust)):
         heading, at_i, at_j, slot = poses[i[m], 2], place_i[m], place_j[m], slots[m]
         c, s = np.cos(heading), np.sin(heading)
@@ -370,7 +369,7 @@ def add_measurements(
             else:
                 above[slot, 0, 2] -= xh
                 above[slot, 1, 2] -= yh
-        for k in range(parameters):  # derivative d of the errors by the calibration, at its border
+        for k in range(len(slope)):  # derivative d of the errors by the calibration, at its border
             share = regressors[m, k]
             if share == 0.0:  # of closures
                 continue
@@ -386,7 +385,7 @@ def add_measurements(
                 right[at_j, 1, 1 + k] += bent_y
                 right[at_j, 2, 1 + k] += b2
             slope[k] += d0 * e0 + d1 * e1 + d2 * e2
-            for other in range(parameters):
+            for other in range(len(slope)):
                 share = regressors[m, other]
                 corner[k, other] += (b0 * measured[m, 1] / 2 - b1 * measured[m, 0] / 2 - b2) * share
 

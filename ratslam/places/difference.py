@@ -1,8 +1,13 @@
-"""What two maps have in common, and what differs."""
+"""What two maps have in common, and what differs.
+
+A keyframe is known by its view and its odometry: keyframes that are equal to the bit in two maps are the
+same. `overlap` finds the sessions that both hold, `difference` compares the places and closures of both.
+"""
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
+from hashlib import blake2b
 
 import numpy as np
 
@@ -18,10 +23,7 @@ accepted ones."""
 def keyframe_content(map: KeyframeMap) -> MapContent:
     """The content of a keyframe map: a keyframe is known by its view and by the odometry into it."""
     graph, solution = map.keyframes(), map.solution()
-    views, labels = map.appearance.stored(np.arange(graph.count))
-    odometry = np.column_stack([graph.motion.rows, graph.length.rows, graph.turn.rows])
-    rows = zip(odometry, np.asarray(views), labels, strict=True)
-    names = [motion.tobytes() + view.tobytes() + label.tobytes() for motion, view, label in rows]
+    names = _contents(map, graph.motion.rows, graph.length.rows, graph.turn.rows)
     closures = solution.log.table()[solution.log.accepted_rows(), :2].astype(int)
     return solution.fit.poses, names, closures
 
@@ -68,3 +70,46 @@ def _pairs(closures: np.ndarray, common: np.ndarray, count: int) -> set[tuple[in
     number = np.full(count, -1)
     number[common] = np.arange(len(common))
     return {(i, j) for i, j in number[closures.astype(int)].reshape(-1, 2).tolist() if min(i, j) >= 0}
+
+
+def _contents(map: KeyframeMap, *odometry: np.ndarray) -> list[bytes]:
+    """[N] the bytes of odometry [N, ...], view and place label of each keyframe."""
+    views, labels = map.appearance.stored(np.arange(map.keyframes().count))
+    rows = zip(np.column_stack(odometry), np.asarray(views), labels, strict=True)
+    return [motion.tobytes() + view.tobytes() + label.tobytes() for motion, view, label in rows]
+
+
+LEAST = 8
+"""Number of different keyframes, equally far apart in both maps, from which on they are those of one session:
+rows of coarse odometry and of views without contact may be equal by chance, but not in one order."""
+
+
+Span = tuple[int, int]
+
+Remembered = tuple[dict[bytes, int], np.ndarray]
+"""The keyframes of a map, to be found again in other maps: the number of the first keyframe of each name,
+where equal names are equal keyframes; and the steps [N] at which the keyframes were taken."""
+
+
+def remembered(map: KeyframeMap) -> Remembered:
+    """The keyframes of a map. They are named by view, place label, distance and turn by odometry, which stay
+    as they are when a map is continued, corrected, cropped or merged."""
+    graph, first = map.keyframes(), dict[bytes, int]()
+    for number, content in enumerate(_contents(map, graph.length.rows, graph.turn.rows)):
+        first.setdefault(blake2b(content, digest_size=16).digest(), number)
+    return first, map.keyframe_steps()
+
+
+def overlap(one: Remembered, other: Remembered) -> tuple[int, Span, Span] | None:
+    """The number of keyframes of one session that two maps have, and their first and last step in each; None
+    if there are none."""
+    (known, steps), (again, other_steps) = one, other
+    pairs = [(number, again[name]) for name, number in known.items() if name in again]
+    apart = Counter(second - first for first, second in pairs)
+    needed = min(LEAST, max(min(len(known), len(again)) - 1, 2))
+    shifts = {shift for shift, count in apart.items() if count >= needed}
+    common = np.array([pair for pair in pairs if pair[1] - pair[0] in shifts], int).reshape(-1, 2)
+    if not len(common):
+        return None
+    spans = (steps[common[:, 0]], other_steps[common[:, 1]])
+    return len(common), *((int(span.min()), int(span.max())) for span in spans)

@@ -271,7 +271,7 @@ class Hypotheses(Checkpointed):
         self.pose.append(at.pose)
         self.covariance.append(at.covariance)
         self.log_odds.append(log_odds)
-        self.states.append(uninterrupted(1)[0])
+        self.states.append(NOTHING_CHANGED)
         self.best.append(0.0)
         self.inside.append(True)
 
@@ -304,12 +304,9 @@ SHARE = 1e-4
 """Share of keyframes at which such a stretch begins; each length is as likely as another."""
 
 
-def uninterrupted(count: int) -> np.ndarray:
-    """[count, 1 + LONGEST] log-odds of poses at which all views agreed: of agreement, and of a changed
-    stretch that lasts 1, 2, ... more keyframes."""
-    states = np.full((count, 1 + LONGEST), -np.inf)
-    states[:, 0] = 0.0
-    return states
+NOTHING_CHANGED = np.array([0.0] + [-np.inf] * LONGEST)
+"""Log-odds of a pose at which all views agreed: of agreement, and of a changed stretch that lasts 1, 2, ...
+more keyframes."""
 
 
 def continue_states(states: np.ndarray, odds: np.ndarray, elsewhere: np.ndarray) -> np.ndarray:

@@ -16,9 +16,10 @@ from evaluation.artifacts.run_reader import MERGE_REPORT as REPORT
 from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.recall import RecallBackend
+from ratslam.places.difference import overlap, remembered
 from ratslam.places.joining import Join, Stretches, join_all
 from ratslam.places.map_views import MapViews
-from ratslam.places.union import overlap, remembered, renew_experiences, unite
+from ratslam.places.union import renew_experiences, unite
 from ratslam.runs.estimate import START
 from ratslam.runs.map_results import write_merged_results
 from ratslam.runs.map_settings import assignments, differing_settings, settings_of_map

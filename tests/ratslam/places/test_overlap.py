@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.places.union import LEAST, Remembered, overlap, remembered, unite
+from ratslam.places.difference import LEAST, Remembered, overlap, remembered
+from ratslam.places.union import unite
 from tests.ratslam.mapping.map_cases import BIAS, LAP, drive, new_map, sequence
 
 law = settings(derandomize=True, deadline=None, max_examples=60)
