@@ -46,16 +46,18 @@ class BlockPattern:
         Args:
             diagonal: [n, 3, 3] blocks in the order of elimination. above: [B, 3, 3] blocks above it.
         """
-        layout = self._layout
+        first, rows, *_ = layout = self._layout
         regular, blocks, inverse, logarithm = factorise(self.start, self.row, diagonal, above, layout)
-        return _BlockFactor((*layout[:2], blocks, inverse), float(logarithm)) if regular else None
+        return _BlockFactor((first, rows, blocks, inverse), float(logarithm)) if regular else None
 
 
 class _BlockFactor:
     """The factor L D L^T of a matrix: where its blocks stand, the blocks, the inverses of D; and the natural
     logarithm of the determinant of the matrix."""
 
-    def __init__(self, parts: tuple[np.ndarray, ...], log_determinant: float) -> None:
+    def __init__(
+        self, parts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], log_determinant: float
+    ) -> None:
         self._parts, self.log_determinant = parts, log_determinant
 
     def solve(self, right: np.ndarray) -> np.ndarray:

@@ -129,7 +129,7 @@ class MapProblem(NamedTuple):
         chain = self.chain._replace(variance=self.chain.variance * by)
         return self._replace(chain=chain, links=self.links._replace(variance=self.links.variance * by))
 
-    def cut_at(self, frames: Sequence[int]) -> MapProblem:
+    def cut_at(self, frames: Sequence[int] | np.ndarray) -> MapProblem:
         """The problem with loose odometry before keyframes [n]."""
         if not len(frames):
             return self

@@ -142,8 +142,9 @@ def session_changes(place: Place, visits: Visits, head: Head, tallest: float) ->
             points: the head, and the height (m) of pixel value 1 and of walls.
     """
     appearance, likeness = place.map.appearance, place.map.appearance.metric().likeness
-    known = isinstance(appearance, WhiskerAppearance) and likeness.size > 0
-    if not known or len(appearance.layout.group) != len(head.length) or not len(visits.step):
+    if not isinstance(appearance, WhiskerAppearance) or not likeness.size:
+        return []
+    if len(appearance.layout.group) != len(head.length) or not len(visits.step):
         return []
 
     def contacts_of(frames: np.ndarray) -> ContactMap:
