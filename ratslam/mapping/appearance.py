@@ -227,7 +227,7 @@ class ViewAppearance(Appearance):
             self._scale = count, scale
 
 
-class LearnedAppearance(Appearance):
+class _LearnedAppearance(Appearance):
     """Images compared by log-odds that are learned from the session.
 
     Args:
@@ -268,11 +268,11 @@ class LearnedAppearance(Appearance):
         return float(np.log1p(np.exp(self._temper * self.misfits(frame, near, reversed).min())))
 
 
-class WhiskerAppearance(LearnedAppearance):
+class WhiskerAppearance(_LearnedAppearance):
     """Whisker images compared by the log-odds of the levels of their pixels.
 
     Args:
-        temper: see `LearnedAppearance`. normalise: the preprocessing of recall. half_turns: whether images
+        temper: see `_LearnedAppearance`. normalise: the preprocessing of recall. half_turns: whether images
             are also compared as seen in the opposite direction.
     """
 
@@ -421,7 +421,7 @@ APART = np.arange(1, 9) / 9
 """Shares of all keyframes by which the second image of a pair of different places is moved on in memory."""
 
 
-class SignedAppearance(LearnedAppearance):
+class SignedAppearance(_LearnedAppearance):
     """Images of signed pixels compared by the two-covariance model (`ratslam.recall.signed_likelihood`).
 
     Args:
