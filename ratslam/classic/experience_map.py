@@ -23,8 +23,9 @@ from ratslam.core.backend import NO_CLOSURE, Evidence, Map
 from ratslam.core.estimates import Action, Estimate
 from ratslam.mapping.pose_graph import (
     Edges,
-    GrowingGraph,
+    GraphEquations,
     geman_mcclure,
+    growing_equations,
     huber,
     least_squares,
     no_kernel,
@@ -125,7 +126,7 @@ class ExperienceMap(Checkpointed, Map):
         self._odometry = GrowableArray((3,), np.float64)  # of each step, NaN where it is not known
         self._reached = GrowableArray((2,), np.int64)  # step, and the first step at the node reached
         self._link_of: dict[tuple[int, int], int] = {}
-        self._growing = GrowingGraph()
+        self._growing: GraphEquations | None = None
         self._current = -1
         self._travel = Travel(np.zeros(3))
 
@@ -284,9 +285,10 @@ class ExperienceMap(Checkpointed, Map):
                 "geman_mcclure": geman_mcclure(solver.scale**2),
             }
             poses, edges = self._pose.rows, self.edges()
+            self._growing = growing_equations(len(poses), edges, self._growing)
             solution = least_squares(
                 poses, edges, kernel=kernels[solver.kernel], robust=self._closure.rows,
-                equations=self._growing.equations(len(poses), edges),
+                equations=self._growing,
             )  # fmt: skip
             self._pose.rows[:] = solution.poses
         elif isinstance(solver, Relaxation) and len(self._ends.rows):
@@ -306,7 +308,7 @@ class ExperienceMap(Checkpointed, Map):
         """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self._link_of = {(int(a), int(b)): k for k, (a, b) in enumerate(self._ends.rows)}
-        self._growing = GrowingGraph()
+        self._growing = None
 
 
 TIE = 1e-9

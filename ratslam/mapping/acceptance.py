@@ -1,12 +1,11 @@
 """Rules by which a map accepts closure sequences: by evidence (whiskers), by odds (views, ids).
 
-The odds of a sequence are those of its score among the false sequences of this session (the null), times
-the likelihood ratio of its place under raw odometry (`OdometryScan`), with the calibration for which the
-other sequences vote; or under the map, where its covariance is narrow enough to be linear. Nobody says
-which sequences are false: each counts as false by the probability that it is, as judged last. A sequence of
-score s is then true with odds (T e^(-s/m) / m) / (n e^(-(s - s0)/t) / t), with n false sequences above s0
-and their mean excess t: one step of expectation maximisation (Dempster, Laird & Rubin 1977) of a mixture
-each time.
+The odds of a sequence are those of its score among the false sequences of this session (the null), times the
+likelihood ratio of its place under raw odometry (`OdometryScan`), with the calibration for which the other
+sequences vote; or under the map, where its covariance is narrow enough to be linear. Nobody says which
+sequences are false: each counts as false by the probability that it is, as judged last. A sequence of score s
+is then true with odds (T e^(-s/m) / m) / (n e^(-(s - s0)/t) / t), with n false sequences above s0 and their
+mean excess t: one step of expectation maximisation (Dempster, Laird & Rubin 1977) of a mixture each time.
 
 The vote on the calibration is held before any sequence is accepted: a true sequence favours the heading
 biases and turn errors with which odometry leads to its place, a false one none that others favour as well.
@@ -21,7 +20,7 @@ from scipy.special import expit
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.archive import Archive
-from ratslam.mapping.closure_judge import AT_ONCE, judge_newest
+from ratslam.mapping.closure_judge import AT_ONCE, judge_sequences
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import CONFIRMED_WEIGHT, Candidate, ClosureLog, Verdict
 from ratslam.mapping.map_solution import MapSolution, cheapest_map, solved_map
@@ -29,11 +28,9 @@ from ratslam.mapping.odometry_scan import OdometryScan
 from ratslam.mapping.optimizer import CalibrationPrior
 from ratslam.mapping.verification import (
     break_odometry,
-    joins_pieces,
     judge_by_map,
     map_distance,
-    spans_beginnings,
-    spans_pieces,
+    spans,
 )
 
 
@@ -63,7 +60,8 @@ class AcceptByEvidence(Acceptance):
 
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
         config, score, length = graph.config, log.score(sequence), len(log.members(sequence))
-        if log.verdict(sequence) != Verdict.OPEN or joins_pieces(graph, log, candidate):
+        piece = graph.pieces(log)
+        if log.verdict(sequence) != Verdict.OPEN or piece[candidate.keyframe] != piece[candidate.match]:
             return False
         if length < config.min_length or score < config.min_score:
             return False
@@ -71,7 +69,8 @@ class AcceptByEvidence(Acceptance):
         fits = distance < config.max_distance and score - distance / 2 >= config.min_score
         accepted = fits
         if fits and config.select_every:  # an unlikely sequence waits for the next selection
-            accepted = not judge_newest(graph, log, sequence) < AT_ONCE
+            (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence]))
+            accepted = not odds < AT_ONCE
         log.judge(sequence, Verdict.ACCEPTED if accepted else Verdict.OPEN, distance)
         carried = config.may_be_carried and not config.select_every  # selection places its own cuts
         broken = carried and length >= config.break_length and score >= config.break_score
@@ -155,6 +154,11 @@ def _belief(
     return kept, mean, max(float(np.hypot(sd, mean - kept)), least_sd)
 
 
+_Vote = tuple[np.ndarray, np.ndarray, CalibrationPrior, CalibrationPrior, np.ndarray]
+"""The R sequences [R] that were compared with odometry, their log odds by score [R], and their vote on the
+calibration (`vote`)."""
+
+
 class AcceptByOdds(Acceptance):
     """Judges all open sequences. Odometry is compared on the keyframes as they were taken, of `archive`
     once some are merged."""
@@ -178,7 +182,7 @@ class AcceptByOdds(Acceptance):
     def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
         while len(self._log_ratio.rows) < log.sequences:
             self._log_ratio.append(np.full(len(self._scan.grid), np.nan))
-        length, accepted = log.size(sequence), log.verdict(sequence) == Verdict.ACCEPTED
+        length, accepted = int(log.sizes()[sequence]), log.verdict(sequence) == Verdict.ACCEPTED
         if length < graph.config.min_length:
             return False
         # The middle of a growing sequence moves on slowly: it is compared anew only at lengths of at most
@@ -192,11 +196,10 @@ class AcceptByOdds(Acceptance):
         voted = self._vote(graph, log)
         graph.adopt_prior(log, voted[2])
         among = np.arange(log.sequences) if due else np.array([sequence])
-        return self._accept(graph, log, among, *voted[:2], voted[-1]) or self._break(graph, log, sequence)
+        return self._accept(graph, log, among, voted) or self._break(graph, log, sequence)
 
     def review(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
-        sequences, score_odds, _, _, odds = self._vote(graph, log)
-        return self._accept(graph, log, np.arange(log.sequences), sequences, score_odds, odds)
+        return self._accept(graph, log, np.arange(log.sequences), self._vote(graph, log))
 
     def solution(self, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
         graph, log = graph.copy(), log.copy()
@@ -216,11 +219,7 @@ class AcceptByOdds(Acceptance):
         super().restore(arrays)
         self._scan.clear()
 
-    def _vote(
-        self, graph: KeyframeGraph, log: ClosureLog
-    ) -> tuple[np.ndarray, np.ndarray, CalibrationPrior, CalibrationPrior, np.ndarray]:
-        """The R sequences [R] that were compared with odometry, their log odds by score [R], and their vote
-        on the calibration (`vote`)."""
+    def _vote(self, graph: KeyframeGraph, log: ClosureLog) -> _Vote:
         near = self._scan.near(self._views_prior)
         known = np.isfinite(self._log_ratio.rows[:, near]).all(axis=1)
         sequences = np.flatnonzero(known & (log.verdicts()[: len(known)] != Verdict.UNDONE))
@@ -232,27 +231,14 @@ class AcceptByOdds(Acceptance):
         grid, ratios = self._scan.grid[near], self._log_ratio.rows[sequences][:, near]
         return sequences, score_odds, *vote(grid, self._views_prior, ratios, score_odds, least)
 
-    def _accept(
-        self,
-        graph: KeyframeGraph,
-        log: ClosureLog,
-        among: np.ndarray,
-        sequences: np.ndarray,
-        score_odds: np.ndarray,
-        odds: np.ndarray,
-    ) -> bool:
+    def _accept(self, graph: KeyframeGraph, log: ClosureLog, among: np.ndarray, voted: _Vote) -> bool:
         """Accepts every open sequence of `among` whose odds, by raw odometry or by the map, are high
-        enough; whether there was any.
-
-        Args:
-            sequences, score_odds, odds: see `_vote`.
-        """
-        open_ = log.verdicts()[sequences] == Verdict.OPEN
-        open_ &= (
-            np.isin(sequences, among) & (log.left() > 0)[sequences] & ~spans_pieces(graph, log)[sequences]
-        )
+        enough; whether there was any."""
+        sequences, score_odds, _, _, odds = voted
+        open_ = (log.verdicts()[sequences] == Verdict.OPEN) & np.isin(sequences, among)
+        open_ &= ((log.left() > 0) & ~spans(graph.pieces(log), log))[sequences]
         # No odometry prior at the start of a piece: only the map judges there.
-        accepted = (odds >= MIN_LOG_ODDS) & ~spans_beginnings(graph.begins.rows, log)[sequences]
+        accepted = (odds >= MIN_LOG_ODDS) & ~spans(np.cumsum(graph.begins.rows), log)[sequences]
         undecided = open_ & ~accepted & (score_odds + np.log(graph.count) > 0)
         doubtful = open_ & accepted & graph.config.may_be_carried
         if (undecided | doubtful).any():
@@ -275,8 +261,8 @@ class AcceptByOdds(Acceptance):
     def _break(self, graph: KeyframeGraph, log: ClosureLog, sequence: int) -> bool:
         """Cuts the odometry where a long sequence contradicts it, if the robot may be carried."""
         config = graph.config
-        long = log.size(sequence) >= config.break_length and log.score(sequence) >= config.break_score
-        apart = bool(spans_pieces(graph, log)[sequence])
+        long = log.sizes()[sequence] >= config.break_length and log.score(sequence) >= config.break_score
+        apart = bool(spans(graph.pieces(log), log)[sequence])
         if not (config.may_be_carried and long) or apart or log.verdict(sequence) != Verdict.OPEN:
             return False
         break_odometry(graph, log, sequence)

@@ -64,10 +64,17 @@ class ViewMetric(NamedTuple):
 class Appearance(Checkpointed, ABC):
     """Views of all keyframes."""
 
+    VIEWS: ClassVar[str]
+    """Name of the array of the views, one row for each keyframe."""
     NEAR_SHARE: ClassVar = NEAR
     """See `Ground.near_share`."""
     JUDGED: ClassVar = False
     """Whether `ratslam.mapping.closure_judge` has weights for such views."""
+
+    @property
+    def _views(self) -> GrowableArray:
+        views: GrowableArray = getattr(self, self.VIEWS)
+        return views
 
     def present(self) -> Appearance:
         """The present metric with the views so far, whose memory is shared: a view never changes."""
@@ -87,9 +94,9 @@ class Appearance(Checkpointed, ABC):
     def view_of(self, observation: Observation) -> np.ndarray:
         """[D] the view of an observation, as `stored` gives it of a keyframe."""
 
-    @abstractmethod
     def append(self, observation: Observation, turn: float, length: float) -> None:
         """Adds a keyframe, after a turn (rad) and a distance (m) since the one before."""
+        self._views.append(self.view_of(observation))
 
     def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], np.ndarray]) -> BiasEstimate:
         """Updates the metric from the newest keyframe's evidence and, at intervals, from confirmed pairs.
@@ -99,9 +106,9 @@ class Appearance(Checkpointed, ABC):
         """
         return NO_ESTIMATE
 
-    @abstractmethod
     def extend(self, other: Appearance) -> None:
         """Adds the views of another map of the same sensor; the metric is learned anew by `relearn`."""
+        self._views.extend(other._views.rows)
 
     def gain_prior(self, usual: GainPrior) -> GainPrior:
         """Gains of views before any were counted; `usual` if nothing else is known of them."""
@@ -111,13 +118,13 @@ class Appearance(Checkpointed, ABC):
         """Learns the metric anew from all views and confirmed pairs [P, 3], see
         `Archive.confirmed_pairs`."""
 
-    @abstractmethod
     def take(self, frames: np.ndarray) -> None:
         """Reduces the views to those of keyframes [n]; what was learned of the sensor stays."""
+        self._views.replace(self._views.rows[frames])
 
-    @abstractmethod
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The views [n, D] and ids [n] of keyframes [n], as recall stores them."""
+        """The views [n, D] and ids [n], -1 for none, of keyframes [n], as recall stores them."""
+        return self._views.rows[frames], np.full(len(frames), -1)
 
     @abstractmethod
     def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
@@ -140,10 +147,10 @@ class ViewAppearance(Appearance):
 
     Args:
         size: number of values of a view. fan: field of view, rad; 0: to be estimated; None: the views are
-        not
-            ordered sectors. normalise: the preprocessing of recall.
+            not ordered sectors. normalise: the preprocessing of recall.
     """
 
+    VIEWS = "_view"
     VALUES = ("_scale",)
     PARTS = ("_fan",)
 
@@ -165,7 +172,7 @@ class ViewAppearance(Appearance):
         return np.asarray(view, float).reshape(-1)[:size]
 
     def append(self, observation: Observation, turn: float, length: float) -> None:
-        self._view.append(self.view_of(observation))
+        super().append(observation, turn, length)
         if self._fan:
             self._fan.append(self._view.rows[-1], turn, length)
 
@@ -173,18 +180,12 @@ class ViewAppearance(Appearance):
         assert isinstance(other, ViewAppearance)
         if self._fan and other._fan and len(other._view.rows) > len(self._view.rows):
             self._fan = deepcopy(other._fan)  # the longer session knows the sectors better
-        self._view.extend(other._view.rows)
+        super().extend(other)
         self._background.extend(other._background.rows)
 
     def relearn(self, pairs: np.ndarray) -> None:
         self._scale = 0, self._scale[1]
         self._rescale()
-
-    def take(self, frames: np.ndarray) -> None:
-        self._view.replace(self._view.rows[frames])
-
-    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._view.rows[frames], np.full(len(frames), -1)
 
     def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], np.ndarray]) -> BiasEstimate:
         errors = np.asarray(evidence.background)
@@ -226,75 +227,36 @@ class ViewAppearance(Appearance):
             self._scale = count, scale
 
 
-class WhiskerAppearance(Appearance):
-    """Whisker images compared by log-odds that are learned from the session.
+class _LearnedAppearance(Appearance):
+    """Images compared by log-odds that are learned from the session.
 
     Args:
-        temper: factor on the log-odds, see `RecallConfig`. normalise: the preprocessing of recall.
-        half_turns: whether images are also compared as seen in the opposite direction.
+        temper: factor on the log-odds, see `RecallConfig`. angle: turn per sector shift, rad.
     """
 
     VALUES = ("_likeness",)
-    JUDGED = True
 
-    def __init__(
-        self,
-        pixels: PixelLayout,
-        temper: float,
-        normalise: Callable[[np.ndarray], np.ndarray] = np.asarray,
-        half_turns: bool = True,
-    ) -> None:
-        self._pixels, self._temper, self._normalise = pixels, temper, normalise
-        self._angle = np.pi if half_turns else 0.0
-        self._level = GrowableArray((len(pixels.group),), np.int64)
-        self._likeness = NO_LIKENESS
+    def __init__(self, temper: float, angle: float) -> None:
+        self._temper, self._angle, self._likeness = temper, angle, NO_LIKENESS
 
     def metric(self) -> ViewMetric:
         return ViewMetric(self._angle, NEW_IMAGE_LOG_ODDS if self._likeness.size else 0.0, self._likeness)
 
-    @property
-    def layout(self) -> PixelLayout:
-        """The layout of the pixels."""
-        return self._pixels
-
-    def view_of(self, observation: Observation) -> np.ndarray:
-        view = self._normalise(np.asarray(observation.view, float))
-        return pixel_levels(view.reshape(-1), live_pixels(observation).reshape(-1)).astype(np.int64)
-
-    def append(self, observation: Observation, turn: float, length: float) -> None:
-        self._level.append(self.view_of(observation))
-
-    def extend(self, other: Appearance) -> None:
-        assert isinstance(other, WhiskerAppearance)
-        self._level.extend(other._level.rows)
-
-    def relearn(self, pairs: np.ndarray) -> None:
-        frame, match, reversed = pairs.T
-        images, opposite = self._level.rows, self._pixels.opposite
-        # Matches that face the opposite way are compared as seen in that direction.
-        matched = np.where(reversed[:, None] > 0, images[match][:, opposite], images[match])
-        variation = estimate_variation(images[frame], matched)
-        self._likeness = log_odds_table(estimate_background(images, self._pixels.group), variation)
-
-    def take(self, frames: np.ndarray) -> None:
-        self._level.replace(self._level.rows[frames])
-
-    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._level.rows[frames], np.full(len(frames), -1)
-
     def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], np.ndarray]) -> BiasEstimate:
-        if len(self._level.rows) >= MIN_KEYFRAMES and len(self._level.rows) % LOG_ODDS_INTERVAL == 0:
+        count = len(self._views.rows)
+        if count >= MIN_KEYFRAMES and count % LOG_ODDS_INTERVAL == 0:
             self.relearn(confirmed_pairs())
         return NO_ESTIMATE
+
+    @abstractmethod
+    def learned_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        """`log_odds`, once they are learned, without the temper."""
 
     def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """Negative log-odds; zeros while these are not learned."""
         if not self._likeness.size:
             return np.zeros(len(others))
-        pixels, frames = self._pixels, np.broadcast_to(frame, len(others))
-        return -summed_log_odds(
-            self._likeness, pixels.group, self._level.rows, pixels.opposite, frames, others, reversed
-        )
+        return -self.learned_odds(frame, others, reversed)
 
     def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         return -self._temper * self.misfits(frame, others, reversed)
@@ -304,6 +266,48 @@ class WhiskerAppearance(Appearance):
         if not len(near) or not self._likeness.size:
             return NEUTRAL_IMAGE_MISFIT
         return float(np.log1p(np.exp(self._temper * self.misfits(frame, near, reversed).min())))
+
+
+class WhiskerAppearance(_LearnedAppearance):
+    """Whisker images compared by the log-odds of the levels of their pixels.
+
+    Args:
+        temper: see `_LearnedAppearance`. normalise: the preprocessing of recall. half_turns: whether images
+            are also compared as seen in the opposite direction.
+    """
+
+    VIEWS = "_level"
+    JUDGED = True
+
+    def __init__(
+        self,
+        pixels: PixelLayout,
+        temper: float,
+        normalise: Callable[[np.ndarray], np.ndarray] = np.asarray,
+        half_turns: bool = True,
+    ) -> None:
+        super().__init__(temper, np.pi if half_turns else 0.0)
+        self.layout, self._normalise = pixels, normalise
+        self._level = GrowableArray((len(pixels.group),), np.int64)
+
+    def view_of(self, observation: Observation) -> np.ndarray:
+        view = self._normalise(np.asarray(observation.view, float))
+        return pixel_levels(view.reshape(-1), live_pixels(observation).reshape(-1)).astype(np.int64)
+
+    def relearn(self, pairs: np.ndarray) -> None:
+        frame, match, reversed = pairs.T
+        images, opposite = self._level.rows, self.layout.opposite
+        # Matches that face the opposite way are compared as seen in that direction.
+        matched = np.where(reversed[:, None] > 0, images[match][:, opposite], images[match])
+        variation = estimate_variation(images[frame], matched)
+        self._likeness = log_odds_table(estimate_background(images, self.layout.group), variation)
+
+    def learned_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
+        pixels, frames = self.layout, np.broadcast_to(frame, len(others))
+        images = self._level.rows
+        return summed_log_odds(
+            self._likeness, pixels.group, images, pixels.opposite, frames, others, reversed
+        )
 
 
 @compiled
@@ -378,6 +382,7 @@ LABEL_SPREAD = 0.5
 class LabelAppearance(Appearance):
     """Ids given with the recording. They are seen from anywhere within reach of a place."""
 
+    VIEWS = "_label"
     NEAR_SHARE = 1.0
 
     def __init__(self) -> None:
@@ -392,17 +397,10 @@ class LabelAppearance(Appearance):
     def append(self, observation: Observation, turn: float, length: float) -> None:
         self._label.append(int(observation.label))
 
-    def extend(self, other: Appearance) -> None:
-        assert isinstance(other, LabelAppearance)
-        self._label.extend(other._label.rows)
-
     def gain_prior(self, usual: GainPrior) -> GainPrior:
         """An id is the same at a true pose, and another one at a false pose."""
         same, other = label_gains(len(np.unique(self._label.rows)))
         return (same, LABEL_SPREAD), (other, LABEL_SPREAD)
-
-    def take(self, frames: np.ndarray) -> None:
-        self._label.replace(self._label.rows[frames])
 
     def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((len(frames), 0)), self._label.rows[frames]
@@ -423,32 +421,22 @@ APART = np.arange(1, 9) / 9
 """Shares of all keyframes by which the second image of a pair of different places is moved on in memory."""
 
 
-class SignedAppearance(Appearance):
+class SignedAppearance(_LearnedAppearance):
     """Images of signed pixels compared by the two-covariance model (`ratslam.recall.signed_likelihood`).
 
     Args:
         size: number of pixels of an image, D.
     """
 
-    VALUES = ("_likeness",)
+    VIEWS = "_image"
 
     def __init__(self, size: int) -> None:
+        super().__init__(1.0, 0.0)
         self._image = GrowableArray((size,), np.float64)
-        self._likeness = NO_LIKENESS
-
-    def metric(self) -> ViewMetric:
-        return ViewMetric(0.0, NEW_IMAGE_LOG_ODDS if self._likeness.size else 0.0, self._likeness)
 
     def view_of(self, observation: Observation) -> np.ndarray:
         view = np.asarray(observation.view, float).reshape(-1)
         return stored_image(view, live_pixels(observation).reshape(-1))
-
-    def append(self, observation: Observation, turn: float, length: float) -> None:
-        self._image.append(self.view_of(observation))
-
-    def extend(self, other: Appearance) -> None:
-        assert isinstance(other, SignedAppearance)
-        self._image.extend(other._image.rows)
 
     def relearn(self, pairs: np.ndarray) -> None:
         images, count = self._image.rows, len(self._image.rows)
@@ -458,31 +446,7 @@ class SignedAppearance(Appearance):
         known = ImagePairs(images[pairs[:, 0]], images[pairs[:, 1]])
         self._likeness = pack(learn(images, known, apart))
 
-    def take(self, frames: np.ndarray) -> None:
-        self._image.replace(self._image.rows[frames])
-
-    def stored(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._image.rows[frames], np.full(len(frames), -1)
-
-    def learn(self, evidence: Evidence, confirmed_pairs: Callable[[], np.ndarray]) -> BiasEstimate:
-        count = len(self._image.rows)
-        if count >= MIN_KEYFRAMES and count % LOG_ODDS_INTERVAL == 0:
-            self.relearn(confirmed_pairs())
-        return NO_ESTIMATE
-
-    def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        """Negative log-odds; zeros while these are not learned."""
-        if not self._likeness.size:
-            return np.zeros(len(others))
+    def learned_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         model, images = unpack(self._likeness), self._image.rows
         first = project(model, images[np.atleast_1d(frame)].T)
-        return -log_odds(model, first, project(model, images[others].T))
-
-    def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        return -self.misfits(frame, others, reversed)
-
-    def least_misfit(self, frame: int, near: np.ndarray, reversed: np.ndarray) -> float:
-        """log(1 + 1 / odds) of the most similar of the keyframes."""
-        if not len(near) or not self._likeness.size:
-            return NEUTRAL_IMAGE_MISFIT
-        return float(np.log1p(np.exp(self.misfits(frame, near, reversed).min())))
+        return log_odds(model, first, project(model, images[others].T))

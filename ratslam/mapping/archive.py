@@ -1,5 +1,4 @@
-"""Merging of keyframes during a session, and the archive of all keyframes and candidates as they were
-taken.
+"""Merging of keyframes during a session, and the archive of all keyframes and candidates as they were taken.
 
 A merge takes for granted that its ground is right, and what the map solves for afterwards cannot show that
 it was wrong, because merged keyframes move together. So each time the keyframes have doubled, all closure
@@ -40,8 +39,7 @@ class Archive(Checkpointed):
     Attributes:
         graph: its keyframes, [E]. log: its candidates. Poses and verdicts are those of the last `follow`.
         row: [E] the keyframe of the map that each is or is merged with. offset: [E, 3] its pose in the
-        frame
-            of that one, m, m, rad.
+            frame of that one, m, m, rad.
         pairs: [P, 3] confirmed pairs of which a keyframe was merged, the newest ones.
     """
 
@@ -92,8 +90,7 @@ class Archive(Checkpointed):
         return np.concatenate([self.pairs.rows, _confirmed_pairs(graph, log)])
 
     def poses(self, poses: np.ndarray) -> np.ndarray:
-        """[E, 3] poses of all keyframes by those of the map's keyframes [N, 3]; the same before any
-        merge."""
+        """[E, 3] poses of all keyframes by those of the map's keyframes [N, 3]; the same before any merge."""
         return compose(poses[self.row.rows], self.offset.rows) if self.begun else poses
 
     def follow(self, solution: MapSolution, graph: KeyframeGraph) -> MapSolution:
@@ -192,29 +189,12 @@ class UnmergedMap(Checkpointed):
 
 
 class _ArchiveSelection(Checkpointed):
-    """Selects on the unmerged keyframes each time they have doubled."""
+    """The selection on the unmerged keyframes, begun each time they have doubled."""
 
-    PARTS = ("_job",)
+    PARTS = ("job",)
 
     def __init__(self) -> None:
-        self._job = DelayedJob(THREAD, lambda: UnmergedMap(SelectedMap(ClosureLog(), MapHypotheses())))
-
-    @property
-    def busy(self) -> bool:
-        """Whether a selection is in progress."""
-        return self._job.busy
-
-    def begin(self, archive: Archive) -> None:
-        """Begins a selection if it is due; poses and verdicts of the archive are those of the present
-        map."""
-        count = archive.graph.count
-        unmerged = UnmergedMap(SelectedMap(archive.log.copy(), MapHypotheses()))
-        self._job.begin(count + count // DELAY, partial(unmerged.select, archive.graph.copy()))
-
-    def take(self, count: int) -> UnmergedMap | None:
-        """The result when it is due at `count` keyframes; None if it found no map."""
-        unmerged = self._job.take(count)
-        return unmerged if unmerged is not None and unmerged.selected.found else None
+        self.job = DelayedJob(THREAD, lambda: UnmergedMap(SelectedMap(ClosureLog(), MapHypotheses())))
 
 
 class KeyframeMerger(Checkpointed):
@@ -233,29 +213,28 @@ class KeyframeMerger(Checkpointed):
         self.archive_selection = _ArchiveSelection()
         self.merge_due = False
 
-    def note_selection(self, graph: KeyframeGraph) -> None:
-        """Takes note that a selection has changed the map; a merge is due."""
-        self.merge_due = graph.config.merge_stood > 0
-
     def select(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Begins a selection on the unmerged keyframes if it is due."""
         doublings, rest = divmod(graph.total, FIRST)
         due = rest == 0 and FIRST <= graph.total <= LARGEST and doublings & (doublings - 1) == 0
         if due and self._archive.begun and graph.config.select_every:
             self._archive.follow(MapSolution(graph.fit(), log, graph.cut), graph)
-            self.archive_selection.begin(self._archive)
+            archive, count = self._archive, self._archive.graph.count
+            unmerged = UnmergedMap(SelectedMap(archive.log.copy(), MapHypotheses()))
+            work = partial(unmerged.select, archive.graph.copy())
+            self.archive_selection.job.begin(count + count // DELAY, work)
 
     def merge(
         self, graph: KeyframeGraph, log: ClosureLog, selection: SelectionWorker, experiences: Experiences
     ) -> MergedRows | None:
         """Merges keyframes of confirmed ground if that is due, or replaces the map by the one selected on
         the unmerged keyframes, merged anew; returns what the kernel needs to follow."""
-        if selection.busy:
+        if selection.job.busy:
             return None
-        unmerged = self.archive_selection.take(graph.total)
-        if unmerged is not None:
+        unmerged = self.archive_selection.job.take(graph.total)
+        if unmerged is not None and unmerged.selected.found:
             return self._replace(unmerged, graph, log, selection, experiences)
-        if not self.merge_due or self.archive_selection.busy:
+        if not self.merge_due or self.archive_selection.job.busy:
             return None
         self.merge_due = False
         merge = self.merge_all(graph, log, selection, graph.config.merge_newest)

@@ -11,6 +11,7 @@ poses: without realignment a correct map scores below a wrong one. The most like
 
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -47,15 +48,19 @@ class _CarriedProblem(NamedTuple):
 
     Attributes:
         log: without the candidates that lie across a cut. sequences: [R] those to select from. problem:
-        among
-            these. breaks: of each cut its keyframe, and the first of the sequences after it, the last one
-            if there is none.
+            among these. breaks: of each cut its keyframe, and the first of the sequences after it, the last
+            one if there is none.
     """
 
     log: ClosureLog
     sequences: np.ndarray
     problem: SelectionProblem
     breaks: tuple[tuple[int, int], ...]
+
+    @property
+    def cuts(self) -> np.ndarray:
+        """[n] keyframes before which the odometry is cut."""
+        return np.array([frame for frame, _ in self.breaks], int)
 
     def starts(self, fit: MapFit) -> list[MapFit]:
         """Maps to start from: a fit, and those that follow the sequences in order of time."""
@@ -67,25 +72,16 @@ class _CarriedProblem(NamedTuple):
         return System(self._measurements()).robust_cost(fit) + self.problem.views_cost(fit.poses)
 
     def _measurements(self) -> MapProblem:
-        return self.problem.measurements.cut_at([frame for frame, _ in self.breaks])
+        return self.problem.measurements.cut_at(self.cuts)
 
 
-class _ScoredMap(NamedTuple):
-    """A selection, and its log-likelihood with what all views say, nat.
-
-    Attributes:
-        case: with the sequences of recall. aligned: with those along the poses too. selection: of these.
-    """
-
-    case: _CarriedProblem
-    aligned: _CarriedProblem
-    selection: Selection
-    likelihood: float
+_ScoredMap = tuple[float, Selection, _CarriedProblem, _CarriedProblem]
+"""The log-likelihood of a selection with what all views say, nat; the selection; what it is among: the
+sequences of recall and those along the poses; and the sequences of recall alone."""
 
 
 def is_retraced(graph: KeyframeGraph) -> bool:
-    """Whether the final map of these keyframes, none of them merged, is retraced: not if pieces are
-    given."""
+    """Whether the final map of these keyframes, none of them merged, is retraced: not if pieces are given."""
     config = graph.config
     known = FEWEST_RETRACED <= graph.count <= MOST_RETRACED and not graph.begins.rows.any()
     return bool(config.may_be_carried and config.select_every and known)
@@ -107,10 +103,10 @@ def retraced_solution(graph: KeyframeGraph, solution: MapSolution) -> MapSolutio
     past = np.where(later[:, None], np.float32(-np.inf), fits)  # those at earlier keyframes
     for _ in range(ROUNDS):
         found = [_retrace(graph, fits, compared, odds, newest, log) for compared in (fits, past)]
-        newest = max(found, key=lambda scored: scored.likelihood)
-        best = max(best, newest, key=lambda scored: scored.likelihood)
-    case, cut = best.aligned, _uncut(graph)
-    given = selected_map(graph, case.log, cut, case.sequences, best.selection)
+        newest = max(found, key=itemgetter(0))
+        best = max(best, newest, key=itemgetter(0))
+    _, selection, case, _ = best
+    given = selected_map(graph, case.log, _uncut(graph), case.sequences, selection)
     refused = given.log.verdicts() != Verdict.ACCEPTED
     refused[: log.sequences] = False  # what recall says against the map stays
     given.log.reject_sequences(np.flatnonzero(refused))
@@ -148,10 +144,10 @@ def _retrace(
     log: ClosureLog,
 ) -> _ScoredMap:
     """The map after the robot has been retraced once, by the fits `compared` [N, S, N]."""
-    fit, cuts = before.selection.fit, np.array([frame for frame, _ in before.case.breaks], int)
+    _, (fit, *_), _, case = before
     session = SelfTraverse.of_map(graph, fit, fits)
     compared_there = session._replace(fits=compared)
-    poses, _, cuts = retrace(compared_there, learn_odds(session), cuts, log, graph.sector_angle)
+    poses, _, cuts = retrace(compared_there, learn_odds(session), case.cuts, log, graph.sector_angle)
     case = _carried_problem(graph, log, cuts)
     return _score(graph, fits, odds, case, case.starts(fit._replace(poses=poses)))
 
@@ -169,12 +165,11 @@ def _score(
     selection, aligned = selections[int(np.argmax(likelihoods))], case
     for _ in range(ALIGNED):
         # Among the sequences of the case and those along the poses of the fit.
-        log, cuts = case.log.copy(), np.array([frame for frame, _ in case.breaks], int)
-        session = SelfTraverse.of_map(graph, selection.fit, fits)
-        add_closures_along(log, session, cuts, graph.config.max_gap)
-        aligned = _carried_problem(graph, log, cuts)
+        log, session = case.log.copy(), SelfTraverse.of_map(graph, selection.fit, fits)
+        add_closures_along(log, session, case.cuts, graph.config.max_gap)
+        aligned = _carried_problem(graph, log, case.cuts)
         selection = optimise_with_cuts(aligned.problem, selection.fit, aligned.breaks)
-    return _ScoredMap(case, aligned, selection, _likelihood(graph, fits, odds, case, selection.fit))
+    return _likelihood(graph, fits, odds, case, selection.fit), selection, aligned, case
 
 
 def _likelihood(
@@ -234,7 +229,7 @@ EVEN = GainOdds(np.arange(BINS - 1.0), np.zeros(BINS), 0.0)
 def view_fits(graph: KeyframeGraph) -> np.ndarray:
     """[N, S, N] float32 log-odds that the view of a keyframe (first axis) is one of the place of another
     (last axis), facing alike and, with whiskers, opposite; -inf for those of nearly the same time."""
-    count, shifts = graph.count, 2 if np.cos(graph.sector_angle) < 0 else 1
+    count, shifts = graph.count, 1 + graph.half_turns
     fits = np.empty((count, shifts, count), np.float32)
     every, reversed = np.tile(np.arange(count), shifts), np.repeat(np.arange(shifts) > 0, count)
     for frame in range(count):
@@ -290,12 +285,7 @@ def retrace(
     # The stretches of the map between its cuts, followed on beyond them.
     own, tracks = session.own_odds(odds), []
     for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), session.size], strict=True):
-        track = Track(np.full((session.size, 3), np.nan), np.full(session.size, -np.inf))
-        track.poses[first:last], track.odds[first:last] = session.poses[first:last], own[first:last]
-        for end, stop in ((last - 1, last - 1 + BEYOND), (first, first - BEYOND)):
-            frames, poses, _, gained = session.follow(end, session.poses[end], stop, odds)
-            track.poses[frames], track.odds[frames] = poses, gained
-        tracks.append(track)
+        tracks.append(session.track(first, session.poses[first:last], own[first:last], BEYOND, odds))
     # Where the sequences claim the keyframe of their middle members to be.
     for sequence in np.flatnonzero((log.left() > 1) & (log.verdicts() != Verdict.UNDONE)).tolist():
         members = log.members(sequence)
@@ -316,8 +306,12 @@ def retrace(
 
 def _add(tracks: list[Track], session: SelfTraverse, odds: GainOdds, frame: int, pose: np.ndarray) -> None:
     """Adds the track of a keyframe at a pose [3], unless one leads past it."""
-    if not any(track.leads_past(frame, pose, session.ground) for track in tracks):
-        tracks.append(session.track(frame, pose, AROUND, odds))
+    reach, facing = session.ground.reach, np.cos(session.ground.reach_heading)
+    for poses, _ in tracks:
+        x, y, turn = poses[frame] - pose
+        if np.hypot(x, y) < reach and np.cos(turn) > facing:
+            return
+    tracks.append(session.track_from(frame, pose, AROUND, odds))
 
 
 @compiled

@@ -61,9 +61,8 @@ class SequenceEvidence(NamedTuple):
 
     Attributes:
         odometry_ratio: [n] R; NaN where odometry is broken between the keyframes that a sequence joins,
-        about
-            which nothing is said. counts: [n, 2, 2, KINDS] views of each kind: over the map and over the
-            older pass; of the sequence and around it.
+            about which nothing is said. counts: [n, 2, 2, KINDS] views of each kind: over the map and over
+            the older pass; of the sequence and around it.
     """
 
     odometry_ratio: np.ndarray
@@ -111,12 +110,6 @@ def judge_anew(graph: KeyframeGraph, log: ClosureLog, sequences: np.ndarray) -> 
     by merging the former ones stay."""
     whole = sequences[[not log.has_merged(k) for k in sequences.tolist()]]
     log.set_log_odds(whole, judge_sequences(graph, graph.fit(), log, graph.cut, whole))
-
-
-def judge_newest(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> float:
-    """Log-odds of a sequence of the present map."""
-    (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence])).tolist()
-    return float(odds)
 
 
 def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> float:
@@ -215,15 +208,11 @@ def _fit_elsewhere(graph: KeyframeGraph, frames: np.ndarray) -> np.ndarray:
     others = np.unique(np.linspace(0, graph.count - 1, CONTROLS).astype(int))
     shape = len(frames), len(others)
     row, control = (each.ravel() for each in np.indices(shape))
-    reversed = (control % 2 > 0) & _sees_half_turns(graph)
+    reversed = (control % 2 > 0) & graph.half_turns
     odds = graph.log_odds(frames[row], others[control], reversed).reshape(shape)
     away = np.abs(others - frames[:, None]) > graph.guard
     mean = np.where(away, np.exp(odds), 0.0).sum(axis=1) / np.maximum(away.sum(axis=1), 1)
     return np.where(mean > 0, np.log(np.where(mean > 0, mean, 1.0)), 0.0)
-
-
-def _sees_half_turns(graph: KeyframeGraph) -> bool:
-    return bool(np.cos(graph.sector_angle) < 0)
 
 
 def _count_views(
@@ -242,7 +231,7 @@ def _count_views(
             `_fit_elsewhere`.
     """
     start = ground[way.match - begins] + [0.0, 0.0, way.turn]
-    reach, turns = REACH * graph.cell, np.arange(1 + _sees_half_turns(graph)) * np.pi
+    reach, turns = REACH * graph.cell, np.arange(1 + graph.half_turns) * np.pi
     middle, lag = way.middle - way.low, way.low - begins
     ahead = integrate(motion[middle + 1 :], start)
     back = integrate(inverse(motion[middle:0:-1]), start)[::-1]

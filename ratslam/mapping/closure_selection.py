@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed
+from ratslam.mapping.keyframe_graph import Place
 from ratslam.mapping.merging import Merge
 from ratslam.mapping.optimizer import LoopClosures, MapFit, MapProblem, System
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
@@ -38,10 +39,6 @@ COST_TOLERANCE = 0.5
 """Difference in cost, chi-square, below which two cuts count as equally good."""
 
 
-ViewsCost = Callable[[np.ndarray], float]
-"""What the views say against poses [N, 3] of the keyframes, chi-square."""
-
-
 class SelectionProblem(NamedTuple):
     """The sequences to select from, and the odometry.
 
@@ -50,15 +47,15 @@ class SelectionProblem(NamedTuple):
         evidence: [R] log-likelihood ratios.
         first, last: [R] first and last keyframe of each sequence.
         views_cost: what the views say against poses [N, 3], chi-square.
-        place: moves pieces of the map that are joined together, see `PiecePlacement.place`.
+        place: moves pieces of the map that are joined together, see `placed_pieces`.
     """
 
     measurements: MapProblem
     evidence: np.ndarray
     first: np.ndarray
     last: np.ndarray
-    views_cost: ViewsCost
-    place: Callable[[np.ndarray], np.ndarray] = np.copy
+    views_cost: Callable[[np.ndarray], float]
+    place: Place = np.copy
 
 
 class Selection(NamedTuple):
@@ -133,8 +130,7 @@ def select_closures_and_cuts(
 
 def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
     """[R] squared deviation between the start of each sequence and the odometry since the last accepted
-    closure. Both poses are those of the closures alone, so that a map deformed by a jump does not hide
-    it."""
+    closure. Both poses are those of the closures alone, so that a map deformed by a jump does not hide it."""
     chain, closures, *_ = case.measurements.cut_at([frame for frame, _ in best.cuts])
     strain = np.zeros(len(case.evidence))
     for sequence in range(len(strain)):

@@ -24,9 +24,12 @@ class Experiences(Checkpointed):
 
     Args:
         radius: of an experience, m. heading: largest difference in heading within one, rad.
+
+    Attributes:
+        current: the experience of the newest keyframe, -1 before the first.
     """
 
-    VALUES = ("_current",)
+    VALUES = ("current",)
 
     def __init__(self, radius: float, heading: float) -> None:
         self.radius, self.heading = radius, heading
@@ -35,12 +38,7 @@ class Experiences(Checkpointed):
         self._place = GrowableArray((), np.int64)  # the experience of each keyframe
         self._link = GrowableArray((3,), np.int64)  # from, to, traversals
         self._link_of: dict[tuple[int, int], int] = {}
-        self._current = -1
-
-    @property
-    def current(self) -> int:
-        """The experience of the newest keyframe, -1 before the first."""
-        return self._current
+        self.current = -1
 
     def arrive(
         self, poses: np.ndarray, frame: int, matched: int, reliable: bool, begins: bool = False
@@ -52,15 +50,15 @@ class Experiences(Checkpointed):
             reliable: the map's pose is accurate enough to find a known experience. begins: a piece begins
                 with the keyframe: no link leads to its experience.
         """
-        previous = -1 if begins else self._current
+        previous = -1 if begins else self.current
         place = int(self._place.rows[matched]) if matched >= 0 else -1
         if matched < 0 and len(self._frame.rows):
             # The current experience if in reach, else the nearest in reach if the pose is reliable.
             held, offset = self._frame.rows, self._offset.rows
             far = _measure_distances(poses, held, offset, frame, self.radius, self.heading)
             best = int(np.argmin(far))
-            if self._current >= 0 and far[self._current] <= 1:
-                place = self._current
+            if self.current >= 0 and far[self.current] <= 1:
+                place = self.current
             elif reliable and far[best] <= 1:
                 place = best
         action = Action.NONE
@@ -77,7 +75,7 @@ class Experiences(Checkpointed):
                 self._link_of[previous, place] = len(self._link.rows)
                 self._link.append((previous, place, 0))
             self._link.rows[self._link_of[previous, place], 2] += 1
-        self._current = place
+        self.current = place
         return place, previous, action
 
     def merge(self, source: np.ndarray, onto: np.ndarray, offset: np.ndarray) -> None:
@@ -111,7 +109,7 @@ class Experiences(Checkpointed):
         links = np.column_stack([again[self._link.rows[:, :2]], self._link.rows[:, 2]])
         self._link.replace(links[(links[:, :2] >= 0).all(axis=1)])
         self._link_of = {(a, b): k for k, (a, b, _) in enumerate(self._link.rows.tolist())}
-        self._current = int(again[self._current]) if self._current >= 0 else -1
+        self.current = int(again[self.current]) if self.current >= 0 else -1
 
     def graph(self, poses: np.ndarray, taken: np.ndarray, piece: np.ndarray) -> networkx.DiGraph:
         """Nodes with x, y (m), heading (rad), keyframe, piece; links within pieces with dx, dy, dtheta and

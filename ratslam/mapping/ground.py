@@ -329,8 +329,7 @@ def _density(edges: np.ndarray, counted: np.ndarray, prior: np.ndarray) -> np.nd
 
 
 GroundKey = tuple[int, int, int]
-"""What tells a ground from the others of a map: its number of keyframes, its first and its last
-keyframe."""
+"""What tells a ground from the others of a map: its number of keyframes, its first and its last keyframe."""
 
 
 class LearnedOdds(Checkpointed):

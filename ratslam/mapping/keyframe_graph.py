@@ -7,8 +7,9 @@ for a part of the map. Once accepted closures join it, it is moved to where they
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy, deepcopy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -96,6 +97,11 @@ class KeyframeGraph(Checkpointed):
         """Turn per sector shift of a view, rad; 0 while unknown."""
         return self.appearance.metric().angle
 
+    @property
+    def half_turns(self) -> bool:
+        """Whether views turned by half a turn are compared too, as those of whiskers."""
+        return bool(np.cos(self.sector_angle) < 0)
+
     def copy(self) -> KeyframeGraph:
         """A copy of the present state, which may change independently."""
         other = copy(self)
@@ -118,11 +124,9 @@ class KeyframeGraph(Checkpointed):
 
     def append_newest(self, other: KeyframeGraph) -> None:
         """Adds the newest keyframe of another graph."""
-        pose, motion, length, turn, begins = (
-            array.rows[-1] for array in (other.pose, other.motion, other.length, other.turn, other.begins)
-        )
+        for name, array in self._growable_arrays().items():
+            array.append(getattr(other, name).rows[-1])
         self.reckoned = other.reckoned
-        self._append(pose, motion, length, turn, begins=bool(begins))
 
     def next_start(self) -> np.ndarray:
         """[3] the pose of the next keyframe if it begins a piece."""
@@ -180,7 +184,7 @@ class KeyframeGraph(Checkpointed):
             return first
         motion = correct_heading(self.motion.rows[1:], self.length.rows[1:], bias, turn_error)
         poses = np.concatenate([first, integrate(motion, first[0])])
-        return PiecePlacement(self.begins.rows, *NOTHING_JOINED, self.cell).place(poses)
+        return placed_pieces(poses, self.begins.rows, *NOTHING_JOINED, self.cell)
 
     def dead_reckon(self) -> None:
         """Replaces all poses by odometry with the current calibration."""
@@ -197,43 +201,40 @@ class KeyframeGraph(Checkpointed):
     def move_to(self, fit: MapFit, log: ClosureLog) -> None:
         """Takes over a fit, moved as a whole so that the keyframes move as little as possible; pieces that
         nothing joins to the first one start where they started."""
-        before, first = self.pose.rows.copy(), slice(None)
-        if self.begins.rows.any():
-            first = self.pieces(log) == 0
+        before, first = self.pose.rows.copy(), self.pieces(log) == 0
         poses = compose(fit_rigid_motion(fit.poses[first], before[first]), fit.poses)
-        self.pose.rows[:] = self.placement(log).place(poses)
+        self.pose.rows[:] = self.placement(log)(poses)
         self.bias, self.turn_error = fit.bias, fit.turn_error
 
     def pieces(self, log: ClosureLog) -> np.ndarray:
         """[N] the piece of each keyframe: pieces are joined by accepted closures; a cut separates none."""
-        placement = self.placement(log)
-        return number_pieces(self.begins.rows, np.column_stack([placement.j, placement.i]))
+        i, j, _ = self._joints(log)
+        return number_pieces(self.begins.rows, np.column_stack([j, i]))
 
-    def placement(self, log: ClosureLog) -> PiecePlacement:
-        """What joins the pieces: the closures accepted in a log, and odometry links."""
+    def placement(self, log: ClosureLog) -> Place:
+        """Moves pieces to where the closures now accepted in a log, and odometry links, claim them."""
+        begins, (i, j, turn) = self.begins.rows.copy(), self._joints(log)
+        return lambda poses: placed_pieces(poses, begins, i, j, turn, self.cell)
+
+    def _joints(self, log: ClosureLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What joins the pieces: `i`, `j` and `turn` of `placed_pieces`."""
         if not self.begins.rows.any():
-            return PiecePlacement(self.begins.rows, *NOTHING_JOINED, self.cell)
+            return NOTHING_JOINED
         table = log.table()[log.accepted_middle_first()]
         match, frame = table[:, 1].astype(int), table[:, 0].astype(int)
         turn = np.concatenate([-table[:, 2] * self.sector_angle, np.full(len(self.links.i), np.nan)])
-        i, j = np.concatenate([match, self.links.i]), np.concatenate([frame, self.links.j])
-        return PiecePlacement(self.begins.rows.copy(), i, j, turn, self.cell)
+        return np.concatenate([match, self.links.i]), np.concatenate([frame, self.links.j]), turn
 
     def place_pieces(self, log: ClosureLog) -> None:
-        """Moves pieces as wholes to where the accepted closures claim them, see `PiecePlacement`."""
-        self.pose.rows[:] = self.placement(log).place(self.pose.rows)
+        """Moves pieces as wholes to where the accepted closures claim them."""
+        self.pose.rows[:] = self.placement(log)(self.pose.rows)
 
     def fit(self) -> MapFit:
         """The current poses (not copied) and calibration."""
         return MapFit(self.pose.rows, self.bias, np.zeros(0), self.turn_error)
 
-    def calibration_prior(self) -> CalibrationPrior:
-        """Prior of the calibration in the optimisation."""
-        return self.prior if self.ablation.heading_bias else CalibrationPrior(self.bias, 1e-9)
-
     def odometry(self, cut: GrowableArray) -> OdometryChain:
-        """The odometry between keyframes with its variances, loose at the breaks `cut` and between
-        pieces."""
+        """The odometry between keyframes with its variances, loose at the breaks `cut` and between pieces."""
         return OdometryChain(self.motion.rows[1:], self.length.rows[1:], self.variances(cut)[1:])
 
     def variances(self, cut: GrowableArray) -> np.ndarray:
@@ -248,8 +249,7 @@ class KeyframeGraph(Checkpointed):
         return (cut.rows >= 0) | self.begins.rows
 
     def own_variances(self) -> np.ndarray:
-        """[N, 3] variances of the odometry into each keyframe without breaks, as if no noise were
-        learned."""
+        """[N, 3] variances of the odometry into each keyframe without breaks, as if no noise were learned."""
         learned = np.array([1.0, 1.0, self.heading_noise.factor])
         return self.odometry_variance(self.length.rows, self.turn.rows) / learned
 
@@ -264,7 +264,7 @@ class KeyframeGraph(Checkpointed):
         """[3] variance of the odometry into the newest keyframe."""
         if self.begins.rows[-1]:
             return self._loose_variance()
-        return np.array(self._odometry_variance(float(self.length.rows[-1]), float(self.turn.rows[-1])))
+        return self.odometry_variance(self.length.rows[-1], self.turn.rows[-1])
 
     def closure_variance(self) -> np.ndarray:
         """[3] variance of a closure, m^2, m^2, rad^2."""
@@ -290,7 +290,8 @@ class KeyframeGraph(Checkpointed):
     def problem(self, log: ClosureLog, cut: GrowableArray) -> MapProblem:
         """The least-squares problem of the keyframes with the odometry broken at `cut`."""
         links = self.links._replace(variance=self.links.variance * [1.0, 1.0, self.heading_noise.factor])
-        return MapProblem(self.odometry(cut), self.closures(log), self.calibration_prior(), links)
+        prior = self.prior if self.ablation.heading_bias else CalibrationPrior(self.bias, 1e-9)
+        return MapProblem(self.odometry(cut), self.closures(log), prior, links)
 
     def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """See `Appearance.least_misfits`."""
@@ -360,23 +361,22 @@ class KeyframeGraph(Checkpointed):
     def _loose_variance(self) -> np.ndarray:
         return np.array([LOOSE * self.cell, LOOSE * self.cell, LOOSE]) ** 2
 
-    def odometry_variance(self, length: np.ndarray, turn: np.ndarray) -> np.ndarray:
-        """[n, 3] variances of odometry over these distances [n], m, and sums of absolute turns [n], rad."""
-        return np.stack(self._odometry_variance(length, turn), axis=1)
-
-    def _odometry_variance(self, length: Any, turn: Any) -> tuple[Any, Any, Any]:
+    def odometry_variance(self, length: Any, turn: Any) -> np.ndarray:
+        """[..., 3] variances of odometry over distances [...], m, and sums of absolute turns [...], rad."""
         noise, cell = self.config.noise, self.cell
         along = noise.per_cell**2 * length * cell + (noise.least * cell) ** 2
         least = noise.least_heading**2 * self.heading_noise.factor
-        return along, along, self.heading_variance(length, turn) + least
+        return np.stack([along, along, self.heading_variance(length, turn) + least], axis=-1)
 
 
 APART = 1000.0
 """Distance between the first keyframes of pieces that nothing joins, cells."""
 
 
+Place = Callable[[np.ndarray], np.ndarray]
+"""Moves the pieces of poses [N, 3] to where they belong, see `placed_pieces`."""
 NOTHING_JOINED = np.zeros(0, int), np.zeros(0, int), np.zeros(0)
-"""No closures: `i`, `j` and `turn` of a `PiecePlacement`."""
+"""No closures: `i`, `j` and `turn` of `placed_pieces`."""
 
 
 def piece_start(number: int, cell: float) -> np.ndarray:
@@ -384,51 +384,43 @@ def piece_start(number: int, cell: float) -> np.ndarray:
     return np.array([APART * cell * number, 0.0, 0.0])
 
 
-class PiecePlacement(NamedTuple):
-    """What joins the pieces of N keyframes.
+def placed_pieces(
+    poses: np.ndarray, begins: np.ndarray, i: np.ndarray, j: np.ndarray, turn: np.ndarray, cell: float
+) -> np.ndarray:
+    """[N, 3] the poses [N, 3] with pieces moved as wholes: joined ones that lie apart to where their closures
+    claim, and each that is not joined to the first one to its own start. The first piece stays.
 
-    Attributes:
-        begins: [N] bool, a piece begins with the keyframe. i, j: [M] keyframes of accepted closures, of
-        each
+    Args:
+        begins: [N] bool, a piece begins with the keyframe. i, j: [M] keyframes of accepted closures, of each
             sequence the middle one first, and of odometry links. turn: [M] see `LoopClosures`; NaN for a
             link. cell: m.
     """
-
-    begins: np.ndarray
-    i: np.ndarray
-    j: np.ndarray
-    turn: np.ndarray
-    cell: float
-
-    def place(self, poses: np.ndarray) -> np.ndarray:
-        """[N, 3] the poses with pieces moved as wholes: joined ones that lie apart to where their closures
-        claim, and each that is not joined to the first one to its own start. The first piece stays."""
-        starts = np.flatnonzero(self.begins)
-        if not len(starts):
-            return poses
-        # A stretch is a run of keyframes from one beginning to the next. Joined stretches are moved together;
-        # `group` is the first stretch that each is joined to.
-        poses, stretch = poses.copy(), np.cumsum(self.begins)
-        group = np.arange(int(stretch[-1]) + 1)
-        far = np.hypot(*(poses[self.i] - poses[self.j])[:, :2].T) > APART / 2 * self.cell
-        for m in np.argsort(far, kind="stable").tolist():
-            i, j = int(self.i[m]), int(self.j[m])
-            low, high = sorted((int(group[stretch[i]]), int(group[stretch[j]])))
-            if low == high:
-                continue
-            if far[m] and np.isfinite(self.turn[m]):
-                frames, turn = group[stretch] == high, np.array([0.0, 0.0, self.turn[m]])
-                if frames[j]:  # keyframe j comes to where i claims it, or i to where j does
-                    moved = compose(compose(poses[i], turn), inverse(poses[j]))
-                else:
-                    moved = compose(compose(poses[j], -turn), inverse(poses[i]))
-                poses[frames] = compose(moved, poses[frames])
-            group[group == high] = low
-        for number in np.unique(group)[1:].tolist():
-            start, frames = starts[number - 1], group[stretch] == number
-            moved = compose(piece_start(number, self.cell), inverse(poses[start]))
-            poses[frames] = compose(moved, poses[frames])
+    starts = np.flatnonzero(begins)
+    if not len(starts):
         return poses
+    # A stretch is a run of keyframes from one beginning to the next. Joined stretches are moved together;
+    # `group` is the first stretch that each is joined to.
+    poses, stretch = poses.copy(), np.cumsum(begins)
+    group = np.arange(int(stretch[-1]) + 1)
+    far = np.hypot(*(poses[i] - poses[j])[:, :2].T) > APART / 2 * cell
+    for m in np.argsort(far, kind="stable").tolist():
+        a, b = int(i[m]), int(j[m])
+        low, high = sorted((int(group[stretch[a]]), int(group[stretch[b]])))
+        if low == high:
+            continue
+        if far[m] and np.isfinite(turn[m]):
+            frames, turned = group[stretch] == high, np.array([0.0, 0.0, turn[m]])
+            if frames[b]:  # keyframe b comes to where a claims it, or a to where b does
+                moved = compose(compose(poses[a], turned), inverse(poses[b]))
+            else:
+                moved = compose(compose(poses[b], -turned), inverse(poses[a]))
+            poses[frames] = compose(moved, poses[frames])
+        group[group == high] = low
+    for number in np.unique(group)[1:].tolist():
+        start, frames = starts[number - 1], group[stretch] == number
+        moved = compose(piece_start(number, cell), inverse(poses[start]))
+        poses[frames] = compose(moved, poses[frames])
+    return poses
 
 
 def number_pieces(broken: np.ndarray, closures: np.ndarray) -> np.ndarray:

@@ -1,12 +1,12 @@
 """Loop closures: candidates of recall in sequences that are accepted or refused as a whole.
 
-A single candidate is never accepted. Consecutive candidates that agree with the odometry form a sequence.
-The map accepts a sequence, refuses it, or removes it later; every candidate stays in the log with its
-evidence.
+A single candidate is never accepted. Consecutive candidates that agree with the odometry form a sequence. The
+map accepts a sequence, refuses it, or removes it later; every candidate stays in the log with its evidence.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import deepcopy
 from enum import IntEnum
 from pathlib import Path
@@ -105,6 +105,11 @@ class ClosureLog(Checkpointed):
         self._lines = None
         return self.sequences - 1
 
+    def add_accepted(self, candidates: Iterable[Candidate]) -> None:
+        """Adds the candidates of one sequence, which is accepted."""
+        for k, candidate in enumerate(candidates):
+            self.judge(self.add(candidate, k > 0), Verdict.ACCEPTED)
+
     def members(self, sequence: int) -> np.ndarray:
         """[n, 4] keyframe, match, shift, sequence of the candidates of one sequence."""
         rows = self._candidate.rows[self._among(sequence)]
@@ -124,10 +129,6 @@ class ClosureLog(Checkpointed):
             self._begun = np.searchsorted(newest, np.arange(self.sequences)).tolist()
         following = self._begun[sequence + 1 : sequence + 2]
         return slice(self._begun[sequence], following[0] if following else None)
-
-    def size(self, sequence: int) -> int:
-        """Number of candidates of a sequence, merged ones included."""
-        return len(self.members(sequence)) + int(self._merged.rows[sequence, 1])
 
     def scores(self) -> np.ndarray:
         """[R] evidence of every sequence, merged candidates included."""
@@ -163,8 +164,7 @@ class ClosureLog(Checkpointed):
         self._stood.rows[:] = np.where(strong, self._stood.rows + 1, 0)
 
     def confirm(self, times: int) -> None:
-        """Lets the sequences with a confirming weight count as confirmed by at least that many
-        selections."""
+        """Lets the sequences with a confirming weight count as confirmed by at least that many selections."""
         strong = (self._verdict.rows == Verdict.ACCEPTED) & (self._weight.rows > CONFIRMED_WEIGHT)
         self._stood.rows[strong] = np.maximum(self._stood.rows[strong], times)
 
@@ -173,8 +173,7 @@ class ClosureLog(Checkpointed):
 
         Args:
             gone: [N] bool, merged keyframes. onto: [N] new number of each keyframe, or of the one that it
-            is
-                merged with. turned: [N] bool: faces opposite to that one.
+                is merged with. turned: [N] bool: faces opposite to that one.
         """
         rows, evidence = self._candidate.rows, self._evidence.rows
         lost = gone[rows[:, 0]]
@@ -298,8 +297,7 @@ class ClosureLog(Checkpointed):
         return self._candidate.rows[self.accepted_rows(), :2]
 
     def judged(self) -> np.ndarray:
-        """[n, 3] match, keyframe, and 1 where accepted, 0 where open, -1 where removed, of all
-        candidates."""
+        """[n, 3] match, keyframe, and 1 where accepted, 0 where open, -1 where removed, of all candidates."""
         sign = np.where(
             self._candidate.rows[:, 3] < 0, -1, SIGNS[self._verdict.rows[self._candidate.rows[:, 3]]]
         )
@@ -323,8 +321,7 @@ class ClosureLog(Checkpointed):
 
         Args:
             angle: turn per sector shift, rad. variance: [3] of a closure. scales: robust scale per unit of
-            a
-                sequence's evidence, least scale, largest scale.
+                a sequence's evidence, least scale, largest scale.
         """
         rows = self._candidate.rows[self.accepted_rows()]
         sequences, sequence = np.unique(rows[:, 3], return_inverse=True)

@@ -9,7 +9,7 @@ the odometry is cut where the views indicate it, and the sequence joins the part
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,11 +37,10 @@ from ratslam.mapping.map_solution import (
     worse_than_odometry,
 )
 from ratslam.mapping.odometry_calibration import calibration_from_views, write_calibration
-from ratslam.mapping.piece_ties import FindTie, tie_newest_piece
 from ratslam.mapping.pose_graph import Edges, write_g2o, write_json
 from ratslam.mapping.selection_worker import SelectionWorker
-from ratslam.mapping.step_record import NO_TRAVEL, LiveFilter, StepRecord, Travel, leading_to
-from ratslam.mapping.verification import continues_sequence, has_same_heading
+from ratslam.mapping.step_record import NO_TRAVEL, LiveFilter, StepRecord, leading_to
+from ratslam.mapping.verification import continues_sequence, has_same_heading, spans
 from ratslam.recall.memory import MapFeedback, MergedRows
 from tactile.base.types import Observation
 
@@ -50,6 +49,18 @@ if TYPE_CHECKING:
 
 DOUBT_EVERY = 50
 """Keyframes between two judgements of the present map."""
+TIE_EVERY = 4
+"""Keyframes between two trials of a tie of the newest piece to older keyframes."""
+YOUNG = 400
+"""Number of keyframes of a piece up to which its tie is tried: one that later views contradict is undone."""
+
+Tie = tuple[float, Sequence[Candidate]]
+"""A placement of the newest piece: its log-odds less the logarithm of the number of places (where those of
+another placement are within half of `tie_log_odds`, the difference to the largest of these), and the closures
+that it implies."""
+FindTie = Callable[[KeyframeGraph, ClosureLog, Archive, LearnedOdds], Tie | None]
+"""Finds the best placement of the keyframes since the newest beginning among those before, and keeps the
+odds that it learns for these; None without any."""
 
 
 class KeyframeMap(Checkpointed, Map):
@@ -73,10 +84,11 @@ class KeyframeMap(Checkpointed, Map):
     Attributes:
         log: candidates and sequences of the keyframes that are not merged.
         archive, appearance: of all keyframes ever taken.
+        travel: the motion since the newest keyframe.
         merger, selection: merge keyframes and select closures beside the session.
     """
 
-    VALUES = ("_travel", "_since", "_turned", "_begins", "_solved", "_doubt")
+    VALUES = ("travel", "_since", "_turned", "_begins", "_solved", "_doubt")
     PARTS = (
         "_graph", "log", "_steps", "archive", "merger", "_experiences", "appearance", "_acceptance",
         "_live", "selection", "_tie_odds",
@@ -100,11 +112,11 @@ class KeyframeMap(Checkpointed, Map):
         self.log = ClosureLog()
         self.archive = Archive(KeyframeGraph(config, cell, appearance, guard, ablation))
         self.merger = KeyframeMerger(self.archive)
-        self.selection = SelectionWorker(config.select_every)
+        self.selection = SelectionWorker()
         self._acceptance, self._find_tie = acceptance(self._graph, self.archive), find_tie
         self._experiences = Experiences(config.place_radius * cell, config.place_heading)
         self._live, self._steps, self._tie_odds = LiveFilter(), StepRecord(), LearnedOdds()
-        self._travel = NO_TRAVEL
+        self.travel = NO_TRAVEL
         self._since, self._turned = 0.0, 0.0  # distance (m) and turns (rad) since the last closure
         self._begins = False  # the next keyframe begins a piece
         self._solved = (-1, -1)  # sequence and number of the keyframe of the last optimisation
@@ -124,7 +136,7 @@ class KeyframeMap(Checkpointed, Map):
         a bias that only views show may be wrong."""
         del estimate
         confirmed = (self.log.verdicts() == Verdict.ACCEPTED).any()
-        graph, (motion, length, _) = self._graph, self._travel
+        graph, (motion, length, _) = self._graph, self.travel
         if confirmed:
             return graph.pose_after(motion, length)
         reckoned = self._steps.odometry[-1:]
@@ -257,16 +269,11 @@ class KeyframeMap(Checkpointed, Map):
         """[N] the step at which each keyframe was taken."""
         return self._steps.first_steps(self._graph.total)
 
-    @property
-    def travel(self) -> Travel:
-        """The motion since the newest keyframe."""
-        return self._travel
-
     def begin_piece(self) -> None:
         """The next keyframe begins a piece; steps until then lead to it."""
         self._steps.settle(self._graph.total)
         self._begins = self._graph.count > 0
-        self._travel = NO_TRAVEL
+        self.travel = NO_TRAVEL
         self._since = self._turned = 0.0
 
     def merge(self) -> MergedRows | None:
@@ -278,7 +285,7 @@ class KeyframeMap(Checkpointed, Map):
 
     def update(self, observation: Observation, estimate: Estimate, evidence: Evidence) -> Estimate:
         """Moves by the odometry; a view that became a keyframe is added, judged and given an experience."""
-        graph, self._travel = self._graph, self._travel.onwards(observation.odometry)
+        graph, self.travel = self._graph, self.travel.onwards(observation.odometry)
         place = previous = self._experiences.current
         action = Action.NONE
         if int(evidence.keyframe) >= 0:
@@ -302,9 +309,15 @@ class KeyframeMap(Checkpointed, Map):
         moved = np.array(observation.odometry[:3], float)
         moved = graph.calibrated(moved, float(np.hypot(*moved[:2])))
         frame = leading_to(count) if self._begins or not count else count - 1
-        self._steps.append(frame, self._travel, moved if np.isfinite(moved).all() else np.zeros(3))
+        self._steps.append(frame, self.travel, moved if np.isfinite(moved).all() else np.zeros(3))
         self._forget_solution()
         return estimate._replace(place=place, previous=previous, action=action)
+
+    def add_accepted(self, candidates: Sequence[Candidate]) -> None:
+        """Adds the candidates of one sequence, which is accepted; the map is not optimised."""
+        self.log.add_accepted(candidates)
+        for k, candidate in enumerate(candidates):
+            self.archive.add(candidate, k > 0, self._graph)
 
     def undo(self, sequence: int) -> None:
         """Removes the closures of a sequence and optimises without them.
@@ -319,9 +332,9 @@ class KeyframeMap(Checkpointed, Map):
         self._optimise()
 
     def _append(self, observation: Observation) -> None:
-        motion, length, turn = self._travel
+        motion, length, turn = self.travel
         if self._begins or not self._graph.count:
-            self._steps.arrive(self._graph.total, self._travel)
+            self._steps.arrive(self._graph.total, self.travel)
         if self._begins:
             self._graph.begin_piece()
             motion, length, turn = NO_TRAVEL
@@ -330,7 +343,7 @@ class KeyframeMap(Checkpointed, Map):
         self.archive.append(self._graph)
         self._live.advance(self._graph)
         self._since, self._turned = self._since + length, self._turned + turn
-        self._travel, self._begins = NO_TRAVEL, False
+        self.travel, self._begins = NO_TRAVEL, False
         self.appearance.append(observation, motion[2], length)
 
     def _judge_candidate(self, evidence: Evidence) -> int:
@@ -366,17 +379,39 @@ class KeyframeMap(Checkpointed, Map):
         """Takes up a finished selection and begins the next, ties the newest piece, judges the map."""
         graph, log = self._graph, self.log
         if self.selection.finish(graph, log):
-            self.merger.note_selection(graph)
+            self.merger.merge_due = self.config.merge_stood > 0
             self._forget_solution()
         self.selection.begin(graph, log)
         self.merger.select(graph, log)
-        if self._find_tie and tie_newest_piece(graph, log, self.archive, self._tie_odds, self._find_tie):
+        if self._find_tie and self._tie_newest_piece(self._find_tie):
             self._optimise()
         if graph.total % DOUBT_EVERY == 0:
             self._doubt = worse_than_odometry(graph, MapSolution(graph.fit(), log, graph.cut))
             if not self.config.select_every:  # sequences are then confirmed by each judgement instead
                 log.count_selection()
-                self.merger.note_selection(graph)
+                self.merger.merge_due = self.config.merge_stood > 0
+
+    def _tie_newest_piece(self, find: FindTie) -> bool:
+        """If a trial is due: ties the newest piece where the evidence suffices, or undoes its tie where the
+        views contradict it; whether the map has changed."""
+        graph, log = self._graph, self.log
+        starts = np.flatnonzero(graph.begins.rows)
+        if graph.total % TIE_EVERY or not len(starts) or graph.count - starts[-1] > YOUNG:
+            return False
+        log_odds, closures = find(graph, log, self.archive, self._tie_odds) or (-np.inf, ())
+        # Accepted sequences between keyframes before the newest beginning and since.
+        newest = np.arange(graph.count) >= starts[-1]
+        across = np.flatnonzero(spans(newest, log) & (log.verdicts() == Verdict.ACCEPTED))
+        if not len(across):
+            if log_odds < self.config.tie_log_odds:
+                return False
+            self.add_accepted(closures)
+        elif log_odds >= self.config.tie_log_odds / 2:
+            return False
+        for sequence in across.tolist():
+            log.judge(sequence, Verdict.UNDONE)
+        graph.place_pieces(log)
+        return True
 
     def _given(self) -> MapSolution:
         """The final map, or odometry without closures where that is doubted."""

@@ -16,7 +16,7 @@ the probability that the map is worse than odometry (`python -m ratslam reproduc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from enum import StrEnum
 from functools import partial
@@ -38,7 +38,7 @@ from ratslam.mapping.closure_selection import (
     select_closures,
     select_closures_and_cuts,
 )
-from ratslam.mapping.keyframe_graph import KeyframeGraph, number_pieces
+from ratslam.mapping.keyframe_graph import KeyframeGraph, Place, number_pieces
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
 from ratslam.mapping.odometry_calibration import (
     HeadingNoise,
@@ -47,7 +47,7 @@ from ratslam.mapping.odometry_calibration import (
     starting_noise,
 )
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, System, solve
-from ratslam.mapping.verification import find_break, spans_pieces
+from ratslam.mapping.verification import find_break, spans
 from tactile.base.se2 import between, compose, inverse, wrap
 
 RADIUS = 2.0
@@ -78,8 +78,7 @@ def claimed_revisits(
     first, count = graph.guard + 1, len(poses)
     frames = np.unique(np.linspace(first, count - 1, max(min(count - first, most), 0)).astype(int))
     facing = near_facing(poses, frames, graph.guard, RADIUS * graph.cell, FACING)
-    whiskers = np.cos(graph.sector_angle) < 0  # views turned by half a turn are compared too
-    row, near = np.nonzero(facing if whiskers else facing > 0)
+    row, near = np.nonzero(facing if graph.half_turns else facing > 0)
     frame, reversed = frames[row], facing[row, near] < 0
     if not len(frame):
         return frame, near, np.zeros(0), len(frames)
@@ -109,10 +108,6 @@ def claims_cost(graph: KeyframeGraph, poses: np.ndarray) -> float:
     return float(-2 * each.sum() * len(poses) / (examined * ALONE))
 
 
-Place = Callable[[np.ndarray], np.ndarray]
-"""Moves the pieces of poses [N, 3] to where they belong, see `PiecePlacement.place`."""
-
-
 class Obstacle(StrEnum):
     """Why a closure sequence cannot be undone, as a clause."""
 
@@ -130,9 +125,9 @@ class MapSolution(NamedTuple):
     cut: GrowableArray
 
     def placed(self, graph: KeyframeGraph) -> MapSolution:
-        """The map with the pieces of `graph` where they belong, see `PiecePlacement`; the fit may have
-        moved them."""
-        poses = graph.placement(self.log).place(self.fit.poses)
+        """The map with the pieces of `graph` where they belong, see `placed_pieces`; the fit may have moved
+        them."""
+        poses = graph.placement(self.log)(self.fit.poses)
         return self._replace(fit=self.fit._replace(poses=poses))
 
     def without_closures(self, graph: KeyframeGraph) -> MapSolution:
@@ -196,7 +191,7 @@ def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[Calibra
     """The map of least cost with the closures accepted so far, reached from the current poses and from dead
     reckoning with the mean of each of these calibrations. The log takes over its robust weights."""
     problem = graph.problem(log, graph.cut)
-    place = graph.placement(log).place
+    place = graph.placement(log)
     starts = [graph.fit(), *(_dead_reckoned(graph, prior, place) for prior in priors)]
     system = System(problem)
     fit = min((system.solve(start, 2 * graph.config.settling) for start in starts), key=system.robust_cost)
@@ -205,14 +200,13 @@ def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[Calibra
 
 
 def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypotheses) -> MapSolution | None:
-    """The map with the closure sequences that are best accepted together; None if none has the evidence of
-    an accepted one: weak sequences count only beside it, as images without information give a few of
-    them."""
+    """The map with the closure sequences that are best accepted together; None if none has the evidence of an
+    accepted one: weak sequences count only beside it, as images without information give a few of them."""
     config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
     candidates = sequences_to_select(graph, log)
     if not (candidates & (log.scores() >= config.min_score)).any():
         return None
-    place = graph.placement(log).place
+    place = graph.placement(log)
     sequences = np.flatnonzero(candidates)
     judge_anew(graph, log, sequences)
     broken = np.flatnonzero(np.isin(cut.rows, sequences))
@@ -238,7 +232,7 @@ def sequences_to_select(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
     config = graph.config
     enough = (log.scores() >= config.select_score) & (log.sizes() >= config.select_length)
     possible = (log.left() > 0) & (log.verdicts() != Verdict.UNDONE)
-    return enough & possible & ~spans_pieces(graph, log)
+    return enough & possible & ~spans(graph.pieces(log), log)
 
 
 def selection_problem(

@@ -59,13 +59,12 @@ def find_merge(graph: KeyframeGraph, log: ClosureLog, newest: int) -> Merge | No
     sure = np.flatnonzero(_confirmed_ground(graph, log))
     sure = sure[(sure > guard) & (sure < count - newest)]
     kept, onto, offset = np.ones(count, bool), np.arange(count), np.zeros((count, 3))
-    pose, piece = graph.pose.rows, graph.pieces(log)
-    whiskers = np.cos(graph.sector_angle) < 0  # views turned by half a turn are compared too
+    pose, piece, half_turns = graph.pose.rows, graph.pieces(log), graph.half_turns
     for frame in sure.tolist():
         older = pose[: frame - guard]
         apart = ((older[:, :2] - pose[frame, :2]) ** 2).sum(axis=1) / (NEAR * graph.cell) ** 2
         turned = np.abs(wrap(older[:, 2] - pose[frame, 2]))
-        turned = (np.minimum(turned, np.pi - turned) if whiskers else turned) / FACING
+        turned = (np.minimum(turned, np.pi - turned) if half_turns else turned) / FACING
         joined = kept[: frame - guard] & (piece[: frame - guard] == piece[frame])
         far = np.where(joined & (turned <= 1), apart, np.inf)
         found = np.flatnonzero(far <= 1)

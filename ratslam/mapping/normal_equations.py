@@ -1,11 +1,10 @@
 """The normal equations of the keyframes' poses and of the odometry's calibration, and their factorisation.
 
 The matrix of the poses is symmetric positive definite, with 3 x 3 blocks for the nodes (x, y, heading) and
-for the edges between them. It is factorised as L D L^T, up-looking, by blocks (Davis 2005, ACM TOMS 849);
-the order of elimination (minimum degree) and the sparsity of the factor are computed once for a graph. The
-calibration, one or two dense columns, is the border of the matrix and is solved for by its Schur
-complement. Keyframe 0 is fixed: nodes without a number among the unknowns, position -1, add nothing to the
-equations.
+for the edges between them. It is factorised as L D L^T, up-looking, by blocks (Davis 2005, ACM TOMS 849); the
+order of elimination (minimum degree) and the sparsity of the factor are computed once for a graph. The
+calibration, one or two dense columns, is the border of the matrix and is solved for by its Schur complement.
+Keyframe 0 is fixed: nodes without a number among the unknowns, position -1, add nothing to the equations.
 """
 
 from __future__ import annotations
@@ -47,28 +46,19 @@ class BlockPattern:
         Args:
             diagonal: [n, 3, 3] blocks in the order of elimination. above: [B, 3, 3] blocks above it.
         """
-        layout = self._layout
+        first, rows, *_ = layout = self._layout
         regular, blocks, inverse, logarithm = factorise(self.start, self.row, diagonal, above, layout)
-        return _BlockFactor(*layout[:2], blocks, inverse, float(logarithm)) if regular else None
+        return _BlockFactor((first, rows, blocks, inverse), float(logarithm)) if regular else None
 
 
 class _BlockFactor:
-    """The factor L D L^T of a matrix.
-
-    Attributes:
-        log_determinant: natural logarithm of the determinant of the matrix.
-    """
+    """The factor L D L^T of a matrix: where its blocks stand, the blocks, the inverses of D; and the natural
+    logarithm of the determinant of the matrix."""
 
     def __init__(
-        self,
-        first: np.ndarray,
-        rows: np.ndarray,
-        blocks: np.ndarray,
-        inverse: np.ndarray,
-        log_determinant: float,
+        self, parts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], log_determinant: float
     ) -> None:
-        self._parts = first, rows, blocks, inverse
-        self.log_determinant = log_determinant
+        self._parts, self.log_determinant = parts, log_determinant
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """[n, 3, C] the solutions for the right-hand sides [n, 3, C], in the order of elimination."""
@@ -82,56 +72,16 @@ def elimination_order(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     for low fill-in."""
     if not count:
         return np.zeros(0, np.int64)
-    start, row = neighbours(count, a, b)
-    column = np.repeat(np.arange(count), np.diff(start))
+    node = np.arange(count)
+    ends = np.concatenate([node, a, b]), np.concatenate([node, b, a])
+    matrix = csc_matrix((np.ones(len(ends[0])), ends), (count, count))
     # Only the sparsity pattern matters; the diagonal makes the matrix regular.
-    values = np.where(row == column, 4.0 * len(a) + 1, 1.0)
-    matrix = csc_matrix((values, row, start), (count, count))
+    matrix.data[:] = 1.0
+    matrix.setdiag(4.0 * len(a) + 1)
     options = {"SymmetricMode": True}
     # One column at a time, because there is little fill-in.
     factor = splu(matrix, "MMD_AT_PLUS_A", relax=1, panel_size=1, options=options, diag_pivot_thresh=0.0)
     return factor.perm_c.astype(np.int64)
-
-
-@compiled
-def neighbours(count: int, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the column of each of n nodes begins [n + 1], and the rows of the columns, ascending: the node
-    itself and those that an edge from a [M] to b [M] joins it to."""
-    start = np.zeros(count + 1, np.int32)
-    for m in range(len(a)):
-        start[a[m] + 1] += 1
-        start[b[m] + 1] += 1
-    for k in range(count):
-        start[k + 1] += start[k] + 1
-    rows, end = np.empty(start[count], np.int32), start[:count].copy()
-    for k in range(count):
-        _insert(rows, start[k], end, k, k)
-    for m in range(len(a)):
-        _insert(rows, start[a[m]], end, a[m], b[m])
-        _insert(rows, start[b[m]], end, b[m], a[m])
-    kept = 0
-    for k in range(count):
-        first, start[k] = start[k], kept
-        for p in range(first, end[k]):
-            rows[kept] = rows[p]
-            kept += 1
-    start[count] = kept
-    return start, rows[:kept]
-
-
-@compiled
-def _insert(rows: np.ndarray, first: int, end: np.ndarray, column: int, row: int) -> None:
-    """Puts a row into its place among the ascending `rows` of a column, which begin at `first` and end
-    before end[column], unless it is there."""
-    p = end[column]
-    while p > first and rows[p - 1] > row:
-        p -= 1
-    if p > first and rows[p - 1] == row:
-        return
-    for q in range(end[column], p, -1):
-        rows[q] = rows[q - 1]
-    rows[p] = row
-    end[column] += 1
 
 
 _Layout = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -288,27 +238,13 @@ def _solve_in_place(
 PI = float(np.pi)
 
 
-class Measurements(NamedTuple):
-    """M relative poses of keyframes and what is known of them.
-
-    Attributes:
-        i, j: [M] keyframes. motion: [M, 3] measured pose of keyframe j in the frame of keyframe i (m, m,
-            rad). information: [M, 3] of it. regressors: [M, 2] distance (m) and turn (rad) by which heading
-            bias and turn error bend each measurement, 0 for closures.
-        at_i, at_j: [M] position of the keyframes in the order of elimination, -1 for keyframe 0.
-        slot: [M] block above the diagonal, -1 for edges of keyframe 0.
-    """
-
-    i: np.ndarray
-    j: np.ndarray
-    motion: np.ndarray
-    information: np.ndarray
-    regressors: np.ndarray
-    at_i: np.ndarray
-    at_j: np.ndarray
-    slot: np.ndarray
-
-
+Measurements = tuple[
+    np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray
+]
+"""M relative poses of keyframes and what is known of them: keyframes i and j, [M] each; the measured pose
+[M, 3] of j in the frame of i (m, m, rad) and the information [M, 3] of it; distance (m) and turn (rad) [M, 2]
+by which heading bias and turn error bend it, 0 for closures; the positions [M] of i and of j in the order of
+elimination, -1 for keyframe 0; the block [M] above the diagonal, -1 for edges of keyframe 0."""
 Blocks = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """The equations of n poses and K calibration parameters: of the poses the blocks on the diagonal [n, 3, 3]
 and above it [B, 3, 3]; right-hand sides [n, 3, 1 + K], the negative gradient of the poses and the border
@@ -321,13 +257,14 @@ def measurement_errors(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The measurements [M, 3] without the systematic errors of the odometry, their errors [M, 3] (m, m,
     rad), and their chi-squares [M]."""
-    count = len(edges.i)
+    i, j, motion, information, regressors, _, _, _ = edges
+    count = len(i)
     measured, error, chi2 = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
     for m in range(count):
-        a, b = edges.i[m], edges.j[m]
-        turn = bias * edges.regressors[m, 0] + turn_error * edges.regressors[m, 1]
+        a, b = i[m], j[m]
+        turn = bias * regressors[m, 0] + turn_error * regressors[m, 1]
         c, s = np.cos(turn / 2), np.sin(turn / 2)
-        x, y, heading = edges.motion[m, 0], edges.motion[m, 1], edges.motion[m, 2]
+        x, y, heading = motion[m, 0], motion[m, 1], motion[m, 2]
         measured[m, 0], measured[m, 1] = c * x - s * y, s * x + c * y
         measured[m, 2] = PI - (PI - heading - turn) % (2 * PI)
         c, s = np.cos(poses[a, 2]), np.sin(poses[a, 2])
@@ -338,7 +275,7 @@ def measurement_errors(
         error[m, 2] = PI - (PI - turned) % (2 * PI)
         total = 0.0
         for r in range(3):
-            total += error[m, r] ** 2 * edges.information[m, r]
+            total += error[m, r] ** 2 * information[m, r]
         chi2[m] = total
     return measured, error, chi2
 
@@ -387,15 +324,15 @@ def add_measurements(
     by the pose of keyframe i, and [c s 0], [-s c 0], [0 0 1] by that of keyframe j. The products are
     written out, because loops over their many zeros take several times as long.
     """
+    i, _, _, information, regressors, place_i, place_j, slots = edges
     diagonal, above, right, corner, slope = blocks
-    parameters = len(slope)
     for m in range(len(trust)):
-        heading, at_i, at_j, slot = poses[edges.i[m], 2], edges.at_i[m], edges.at_j[m], edges.slot[m]
+        heading, at_i, at_j, slot = poses[i[m], 2], place_i[m], place_j[m], slots[m]
         c, s = np.cos(heading), np.sin(heading)
         p, q = error[m, 1] + measured[m, 1], -error[m, 0] - measured[m, 0]
-        w0 = edges.information[m, 0] * trust[m]
-        w1 = edges.information[m, 1] * trust[m]
-        w2 = edges.information[m, 2] * trust[m]
+        w0 = information[m, 0] * trust[m]
+        w1 = information[m, 1] * trust[m]
+        w2 = information[m, 2] * trust[m]
         e0, e1, e2 = w0 * error[m, 0], w1 * error[m, 1], w2 * error[m, 2]  # weighted errors
         xx, xy, yy = w0 * c * c + w1 * s * s, (w0 - w1) * c * s, w0 * s * s + w1 * c * c
         xh, yh = w1 * s * q - w0 * c * p, -w0 * s * p - w1 * c * q
@@ -434,8 +371,8 @@ def add_measurements(
             else:
                 above[slot, 0, 2] -= xh
                 above[slot, 1, 2] -= yh
-        for k in range(parameters):  # derivative d of the errors by the calibration, at its border
-            share = edges.regressors[m, k]
+        for k in range(len(slope)):  # derivative d of the errors by the calibration, at its border
+            share = regressors[m, k]
             if share == 0.0:  # of closures
                 continue
             d0, d1, d2 = measured[m, 1] / 2 * share, -measured[m, 0] / 2 * share, -share
@@ -450,8 +387,8 @@ def add_measurements(
                 right[at_j, 1, 1 + k] += bent_y
                 right[at_j, 2, 1 + k] += b2
             slope[k] += d0 * e0 + d1 * e1 + d2 * e2
-            for other in range(parameters):
-                share = edges.regressors[m, other]
+            for other in range(len(slope)):
+                share = regressors[m, other]
                 corner[k, other] += (b0 * measured[m, 1] / 2 - b1 * measured[m, 0] / 2 - b2) * share
 
 
@@ -498,14 +435,3 @@ class Equations(NamedTuple):
             return np.full(border.shape, np.inf), np.zeros(self.corner.shape)
         bent = self.factor.solve(border)
         return bent, self.corner - np.tensordot(border, bent, axes=((0, 1), (0, 1)))
-
-
-def empty_blocks(pattern: BlockPattern, parameters: int) -> Blocks:
-    """Equations without measurements."""
-    return (
-        np.zeros((pattern.count, 3, 3)),
-        np.zeros((len(pattern.row), 3, 3)),
-        np.zeros((pattern.count, 3, 1 + parameters)),
-        np.zeros((parameters, parameters)),
-        np.zeros(parameters),
-    )

@@ -51,9 +51,12 @@ class SectorFan(Checkpointed):
     Args:
         size: number of values of a view. angle: of a sector, counter-clockwise positive, rad; 0: to be
             estimated.
+
+    Attributes:
+        angle: the same; 0 while sectors are not known to be ordered.
     """
 
-    VALUES = ("_angle", "_due")
+    VALUES = ("angle", "_due")
 
     def __init__(self, size: int, angle: float) -> None:
         self.given = angle
@@ -63,13 +66,8 @@ class SectorFan(Checkpointed):
         # Differences of unshifted views, where a fan would shift them.
         self._still = GrowableArray((len(FIELDS_OF_VIEW),), np.float64)
         self._pairs = _no_pairs()
-        self._angle = angle
+        self.angle = angle
         self._due = 1
-
-    @property
-    def angle(self) -> float:
-        """Angle of a sector, rad; 0 while sectors are not known to be ordered."""
-        return self._angle
 
     def append(self, view: np.ndarray, turn: float, length: float) -> None:
         """Adds a keyframe: its view [size], turn (rad) and distance (m) since the one before."""
@@ -93,17 +91,17 @@ class SectorFan(Checkpointed):
             best = int(np.argmax(np.where(count >= MIN_COUNT, total, -np.inf)))
             plain = total[best] > MIN_IMPROVEMENT * self._still.rows[:, best].sum()
             if count[best] >= MIN_COUNT and sure[best] > MIN_SIGNIFICANCE and plain:
-                self._angle = float(FIELDS_OF_VIEW[best] / self._view.rows.shape[1])
+                self.angle = float(FIELDS_OF_VIEW[best] / self._view.rows.shape[1])
                 self._due = 2 * len(gain)
                 self._pairs = _no_pairs()
-        if not self._angle or len(self._view.rows) < 2 * MIN_COUNT:
+        if not self.angle or len(self._view.rows) < 2 * MIN_COUNT:
             return NO_ESTIMATE
         for lag, pairs in self._pairs.items():  # of keyframes `lag` apart, those added since
             done, count = len(pairs.rows), len(self._view.rows) - lag
             if count > done:
                 for row in self._measure_turns(np.arange(done, count) + lag, lag):
                     pairs.append(row)
-        answers = [_fit_slope(self._pairs[lag].rows, abs(self._angle)) for lag in LAGS]
+        answers = [_fit_slope(self._pairs[lag].rows, abs(self.angle)) for lag in LAGS]
         values, errors = zip(*answers, strict=True)
         variance = np.mean([error**2 for error in errors]) + (values[0] - values[1]) ** 2
         return float(np.mean(values)), float(np.sqrt(variance))
@@ -111,7 +109,7 @@ class SectorFan(Checkpointed):
     def _measure_turns(self, at: np.ndarray, lag: int) -> np.ndarray:
         """[n, 3] heading error (rad), its weight, and distance (m) of keyframes `at` [n] and those `lag`
         before."""
-        angle, step = self._angle, np.cumsum(self._step.rows, axis=0)
+        angle, step = self.angle, np.cumsum(self._step.rows, axis=0)
         turn, length = (step[at] - step[at - lag]).T
         view, offset = self._view.rows, SCAN * abs(angle)
         shift = -(turn + offset[:, None]) / angle

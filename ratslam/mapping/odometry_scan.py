@@ -72,8 +72,7 @@ class OdometryScan:
 
         Args:
             graph: of all keyframes so far, which grow from call to call. member: keyframe, match and shift
-            of
-                the closure. near: points of the grid to compute; elsewhere NaN.
+                of the closure. near: points of the grid to compute; elsewhere NaN.
         """
         # Keyframes added since are dead reckoned one at a time: every path has the same bits whenever it is
         # computed.
@@ -140,9 +139,8 @@ def _compute_log_ratios(
 
     Args:
         path, total: see `_extend_paths`. points: of the grid [G, 2]. variance: [j - i, 2] along and of
-        heading
-            into each keyframe between. turned: by which the match is turned, rad. old: number of keyframes
-            that could be recalled. gate: variance of position and heading added. ratios: [G].
+            heading into each keyframe between. turned: by which the match is turned, rad. old: number of
+            keyframes that could be recalled. gate: variance of position and heading added. ratios: [G].
     """
     heading, apart = np.empty(j + 1), np.empty(old)
     measured, driven, net = total[: j + 1, 0].copy(), total[: j + 1, 1].copy(), total[: j + 1, 2].copy()

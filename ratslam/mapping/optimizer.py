@@ -1,5 +1,4 @@
-"""Robust SE(2) least squares over a chain of keyframes with closure sequences and the odometry's
-calibration.
+"""Robust SE(2) least squares over a chain of keyframes with closure sequences and the odometry's calibration.
 
 A constant turn of the odometry to one side, the heading bias (rad/m), and the share by which its turns are
 wrong, the turn error (rad/rad), are solved for with the poses. Each closure sequence has one robust weight,
@@ -21,9 +20,7 @@ import numpy as np
 from ratslam.mapping.normal_equations import (
     BlockPattern,
     Equations,
-    Measurements,
     add_measurements,
-    empty_blocks,
     measurement_errors,
     weigh_closures,
 )
@@ -132,7 +129,7 @@ class MapProblem(NamedTuple):
         chain = self.chain._replace(variance=self.chain.variance * by)
         return self._replace(chain=chain, links=self.links._replace(variance=self.links.variance * by))
 
-    def cut_at(self, frames: Sequence[int]) -> MapProblem:
+    def cut_at(self, frames: Sequence[int] | np.ndarray) -> MapProblem:
         """The problem with loose odometry before keyframes [n]."""
         if not len(frames):
             return self
@@ -267,7 +264,7 @@ class System:
         spread = np.broadcast_to(closures.variance, (len(closures.i), 3))
         information = 1 / np.concatenate([chain.variance, links.variance, spread])
         regressors = np.column_stack([lengths, turns])
-        self._edges = Measurements(i, j, motion, information, regressors, at_i, at_j, slot)
+        self._edges = i, j, motion, information, regressors, at_i, at_j, slot
         limit = np.broadcast_to(np.asarray(closures.cost_limit, float), closures.scale.shape)
         self._closures = len(chain.length) + len(links.length), closures.sequence, closures.scale, limit
         self._parameters, self._problem = 1 + int(prior.turn_error_sd > 0), problem
@@ -327,7 +324,11 @@ class System:
         poses = np.ascontiguousarray(fit.poses)
         measured, error, chi2 = self._errors(fit)
         trust, weights, _ = weigh_closures(chi2, *self._closures)
-        diagonal, above, right, corner, slope = empty_blocks(self._pattern, self._parameters)
+        n, blocks, parameters = self._pattern.count, len(self._pattern.row), self._parameters
+        diagonal, above, right = (
+            np.zeros(shape) for shape in ((n, 3, 3), (blocks, 3, 3), (n, 3, 1 + parameters))
+        )
+        corner, slope = np.zeros((parameters, parameters)), np.zeros(parameters)
         add_measurements(self._edges, poses, measured, error, trust, (diagonal, above, right, corner, slope))
         off, tight = _calibration(fit, self._problem.prior)
         return Equations(

@@ -43,20 +43,18 @@ class Edges(NamedTuple):
     information: np.ndarray
 
 
-def difference_error(poses: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+@compiled
+def difference_error(
+    poses: np.ndarray, i: np.ndarray, j: np.ndarray, motion: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The error of g2o: the pose of j in the frame of i, minus the measured one, in the measured frame.
+
+    Args:
+        i, j, motion: see `Edges`.
 
     Returns:
         errors [E, 3] and their Jacobians [E, 3, 3] by the poses of i and of j.
     """
-    return _differences(poses, edges.i, edges.j, edges.motion)
-
-
-@compiled
-def _differences(
-    poses: np.ndarray, i: np.ndarray, j: np.ndarray, motion: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """See `difference_error`."""
     error, by_a, by_b = np.empty((len(i), 3)), np.zeros((len(i), 3, 3)), np.zeros((len(i), 3, 3))
     for e in range(len(i)):
         a, b, (x, y, turn) = poses[i[e]], poses[j[e]], motion[e]
@@ -176,8 +174,7 @@ def _add_edges(
 
     Args:
         ends: [E] position of either node in the order of elimination, -1 for node 0, and the block above
-        the
-            diagonal. blocks: diagonal [n, 3, 3], above [B, 3, 3], right [n, 3, 1].
+            the diagonal. blocks: diagonal [n, 3, 3], above [B, 3, 3], right [n, 3, 1].
     """
     (at_i, at_j, slot), (error, by_i, by_j), (diagonal, above, right) = ends, errors, blocks
     pull, tight = np.empty(3), np.empty((3, 3))
@@ -234,8 +231,7 @@ no_kernel: Kernel = (np.ones_like, lambda chi2: chi2, np.zeros_like)
 
 
 def huber(scale: float) -> Kernel:
-    """Cost linear beyond `scale` standard deviations, so the influence of an edge is bounded (Huber
-    1964)."""
+    """Cost linear beyond `scale` standard deviations, so the influence of an edge is bounded (Huber 1964)."""
     return (
         lambda chi2: np.minimum(1.0, scale / np.sqrt(np.maximum(chi2, 1e-300))),
         lambda chi2: np.where(chi2 <= scale**2, chi2, 2 * scale * np.sqrt(chi2) - scale**2),
@@ -244,8 +240,7 @@ def huber(scale: float) -> Kernel:
 
 
 def geman_mcclure(mu: float) -> Kernel:
-    """Cost bounded by mu: an error far beyond sqrt(mu) standard deviations has no influence (Geman
-    1985)."""
+    """Cost bounded by mu: an error far beyond sqrt(mu) standard deviations has no influence (Geman 1985)."""
 
     def curvature(chi2: np.ndarray) -> np.ndarray:
         weight = (mu / (mu + chi2)) ** 2
@@ -265,8 +260,7 @@ class Termination(Enum):
 
 
 class Solution(NamedTuple):
-    """Poses [N, 3], reason for the end, number of steps, final cost, and robust weights [E] of the
-    edges."""
+    """Poses [N, 3], reason for the end, number of steps, final cost, and robust weights [E] of the edges."""
 
     poses: np.ndarray
     termination: Termination
@@ -341,7 +335,7 @@ def _evaluate(
     poses: np.ndarray, edges: Edges, information: np.ndarray, kernel: Kernel, robust: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray, float]:
     """Errors with Jacobians, robust weights [E] and curvature [E], and cost at some poses."""
-    errors = difference_error(poses, edges)
+    errors = difference_error(poses, edges.i, edges.j, edges.motion)
     with np.errstate(over="ignore", invalid="ignore"):
         chi2 = _chi_squares(errors[0], information)
         among, weights, curvature = chi2[robust], np.ones(len(chi2)), np.zeros(len(chi2))
@@ -351,25 +345,21 @@ def _evaluate(
     return errors, weights, curvature, float(chi2.sum())
 
 
-class GrowingGraph:
-    """What can be kept of the equations of a graph to which nodes and edges are added.
+def growing_equations(count: int, edges: Edges, before: GraphEquations | None) -> GraphEquations | None:
+    """The equations of a graph to which nodes and edges are added, None without edges.
 
-    The order of elimination is computed whenever the number of edges has grown by `GROWN`, from the edges
-    up to a number that follows from their number now: so a graph that was loaded is solved to the same
-    bits.
+    The order of elimination is computed whenever the number of edges has grown by `GROWN`, from the edges up
+    to a number that follows from their number now: so a graph that was loaded is solved to the same bits.
+
+    Args:
+        count: number of nodes. edges: those of the last call come first. before: what the last call gave.
     """
-
-    def __init__(self) -> None:
-        self._last: GraphEquations | None = None
-
-    def equations(self, count: int, edges: Edges) -> GraphEquations | None:
-        """Of the graph with `count` nodes; the edges of the last call come first. None without edges."""
-        if not len(edges.i):
-            return None
-        if self._last is None or self._last.size != (count, len(edges.i)):
-            ordered = int(GROWN ** np.floor(np.log(len(edges.i)) / np.log(GROWN) + 1e-9))
-            self._last = GraphEquations(count, edges, ordered, self._last)
-        return self._last
+    if before is not None and before.size == (count, len(edges.i)):
+        return before
+    if not len(edges.i):
+        return None
+    ordered = int(GROWN ** np.floor(np.log(len(edges.i)) / np.log(GROWN) + 1e-9))
+    return GraphEquations(count, edges, ordered, before)
 
 
 EXPECTED = "a map.json written by ratslam"

@@ -1,9 +1,8 @@
 """Tracks: a pose hypothesis followed from keyframe to keyframe, and how well the views fit on the way.
 
-The keyframes of a map are the ground, and the same keyframes in order of time are the session that is
-placed on it; none is compared with keyframes of nearly the same time. The rule is that of
-`ratslam.mapping.ground` with variances of position and heading alone, in compiled loops, because hundreds
-of tracks are followed."""
+The keyframes of a map are the ground, and the same keyframes in order of time are the session that is placed
+on it; none is compared with keyframes of nearly the same time. The rule is that of `ratslam.mapping.ground`
+with variances of position and heading alone, in compiled loops, because hundreds of tracks are followed."""
 
 from __future__ import annotations
 
@@ -32,16 +31,8 @@ CLIPPED = 20.0
 """Largest absolute log-odds of one view when many poses are compared at once, nat."""
 
 
-class Track(NamedTuple):
-    """Poses [N, 3], and log-odds [N] of each keyframe: NaN and -inf where the track does not lead."""
-
-    poses: np.ndarray
-    odds: np.ndarray
-
-    def leads_past(self, frame: int, pose: np.ndarray, ground: Ground) -> bool:
-        """Whether the track has a keyframe near a pose [3]."""
-        near = np.hypot(*(self.poses[frame] - pose)[:2]) < ground.reach
-        return bool(near and np.cos(self.poses[frame, 2] - pose[2]) > np.cos(ground.reach_heading))
+Track = tuple[np.ndarray, np.ndarray]
+"""Poses [N, 3], and log-odds [N] of each keyframe: NaN and -inf where the track does not lead."""
 
 
 class SelfTraverse(NamedTuple):
@@ -109,16 +100,22 @@ class SelfTraverse(NamedTuple):
         found = _follow(on.poses, on.turns, self.fits, *session, *reach, odds.edges, odds.odds, pose)
         return frames[: len(found[0])], *found
 
-    def track(self, frame: int, pose: np.ndarray, extent: int, odds: GainOdds) -> Track:
-        """The track through a keyframe at a pose [3], at most `extent` keyframes before and after it."""
-        track = Track(np.full((self.size, 3), np.nan), np.full(self.size, -np.inf))
-        fit = self._fit(frame, pose)
-        track.poses[frame] = pose
-        track.odds[frame] = LEAVING if np.isnan(fit) else odds.of(fit)
-        for stop in (frame + extent, frame - extent):
-            frames, poses, _, gained = self.follow(frame, pose, stop, odds)
-            track.poses[frames], track.odds[frames] = poses, gained
+    def track(self, first: int, poses: np.ndarray, gained: np.ndarray, extent: int, odds: GainOdds) -> Track:
+        """The track through the keyframes from number `first` on at `poses` [n, 3], where they have these
+        log-odds [n], and at most `extent` keyframes after and before them."""
+        every, of_each = track = np.full((self.size, 3), np.nan), np.full(self.size, -np.inf)
+        last = first + len(poses) - 1
+        every[first : last + 1], of_each[first : last + 1] = poses, gained
+        for end, stop in ((last, last + extent), (first, first - extent)):
+            frames, onwards, _, more = self.follow(end, every[end].copy(), stop, odds)
+            every[frames], of_each[frames] = onwards, more
         return track
+
+    def track_from(self, frame: int, pose: np.ndarray, extent: int, odds: GainOdds) -> Track:
+        """The track through a keyframe at a pose [3]."""
+        fit = self._fit(frame, pose)
+        gained = LEAVING if np.isnan(fit) else odds.of(fit)
+        return self.track(frame, pose[None], np.array([gained]), extent, odds)
 
     def places(self) -> np.ndarray:
         """[C, 3] poses that a robot may have on the ground, one of each that can be told apart."""

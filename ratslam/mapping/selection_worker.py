@@ -111,15 +111,14 @@ class SelectedMap(Checkpointed):
         return self
 
     def take_up(self, graph: KeyframeGraph, log: ClosureLog) -> None:
-        """Moves the map to the selected one, continued by the poses since; verdicts given since then
-        stay."""
+        """Moves the map to the selected one, continued by the poses since; verdicts given since then stay."""
         self.judge(log)
         size, (bias, turn_error) = len(self.poses), self.calibration
         graph.cut.rows[:size] = self.cut.rows
         graph.heading_noise = self.noise
         moved = compose(self.poses[-1], inverse(graph.pose.rows[size - 1]))
         poses = np.concatenate([self.poses, compose(moved, graph.pose.rows[size:])])
-        start = MapFit(graph.placement(log).place(poses), bias, np.zeros(0), turn_error)
+        start = MapFit(graph.placement(log)(poses), bias, np.zeros(0), turn_error)
         fit = solve(start, graph.problem(log, graph.cut), STEPS, FINE)
         log.weigh(fit.weights)
         graph.move_to(fit, log)
@@ -131,29 +130,20 @@ class SelectedMap(Checkpointed):
 
 
 class SelectionWorker(Checkpointed):
-    """Selects every so many keyframes.
-
-    Args:
-        every: number of keyframes between two selections, 0: never.
-    """
+    """Selects every so many keyframes, see `KeyframeMapConfig.select_every`."""
 
     PARTS = ("hypotheses", "job")
 
-    def __init__(self, every: int) -> None:
-        self._every = every
+    def __init__(self) -> None:
         self.job = DelayedJob(THREAD, lambda: SelectedMap(ClosureLog(), MapHypotheses()))
         self.hypotheses = MapHypotheses()
 
-    @property
-    def busy(self) -> bool:
-        """Whether a selection is in progress."""
-        return self.job.busy
-
     def begin(self, graph: KeyframeGraph, log: ClosureLog) -> None:
         """Begins a selection if it is due."""
-        if self._every and graph.total % self._every == 0:
+        every = graph.config.select_every
+        if every and graph.total % every == 0:
             selected = SelectedMap(log.copy(), deepcopy(self.hypotheses))
-            due = graph.total + min(DELAY, self._every)
+            due = graph.total + min(DELAY, every)
             self.job.begin(due, partial(selected.select, graph.copy()))
 
     def finish(self, graph: KeyframeGraph, log: ClosureLog) -> bool:

@@ -128,8 +128,7 @@ class StepRecord(Checkpointed):
 
 
 def settled(frame: np.ndarray, count: int) -> np.ndarray:
-    """[T] numbers of steps; those that lead to no keyframe of `count` taken ones have that of the
-    newest."""
+    """[T] numbers of steps; those that lead to no keyframe of `count` taken ones have that of the newest."""
     return np.where(frame <= leading_to(count), count - 1, frame)
 
 
@@ -147,8 +146,7 @@ class LiveFilter(Checkpointed):
 
     Attributes:
         covariance: [3, 3] in the frame of the map, m, m, rad. strayed: sum of the corrections since the
-        last
-            optimisation, standard deviations of a closure.
+            last optimisation, standard deviations of a closure.
     """
 
     VALUES = ("covariance", "strayed")

@@ -141,58 +141,42 @@ def session_changes(place: Place, visits: Visits, head: Head, tallest: float) ->
         visits: of the session; `Change.keyframes` number them. head, tallest: how whisker images become
             points: the head, and the height (m) of pixel value 1 and of walls.
     """
-    made = _contacts_of(place, place.frames, head, tallest)
-    if made is None or not len(visits.step):
+    appearance, likeness = place.map.appearance, place.map.appearance.metric().likeness
+    if not isinstance(appearance, WhiskerAppearance) or not likeness.size:
         return []
+    if len(appearance.layout.group) != len(head.length) or not len(visits.step):
+        return []
+
+    def contacts_of(frames: np.ndarray) -> ContactMap:
+        ground = place.ground._replace(poses=place.map.solution().fit.poses[frames])
+        levels = appearance.stored(frames)[0].astype(int)
+        return ContactMap(ground, levels, appearance.layout, likeness, head, tallest)
+
     radius = RADIUS * place.ground.reach
-    known = np.full(len(visits.step), len(place.frames))
-    signs = contact_signs(made, visits.pose, visits.view.astype(int), known)
+    count = np.full(len(visits.step), len(place.frames))
+    signs = contact_signs(contacts_of(place.frames), visits.pose, visits.view.astype(int), count)
     # Signs in the map itself: its later two thirds, each keyframe compared with those long before it.
     graph = place.map.keyframes()
-    every, late = np.arange(graph.count), np.arange(graph.count // 3, graph.count)
-    own = _contacts_of(place, every, head, tallest)
-    assert own is not None
+    late = np.arange(graph.count // 3, graph.count)
+    own = contacts_of(np.arange(graph.count))
     revisits = contact_signs(own, own.ground.poses[late], own.levels[late], late - graph.guard)
     return find_changes(signs, learn_chance(revisits, radius), radius)
-
-
-def _contacts_of(place: Place, frames: np.ndarray, head: Head, tallest: float) -> ContactMap | None:
-    """The contacts of keyframes [n] of a map; None where its views are not images of the head's whiskers, or
-    recall has not learned to compare them."""
-    appearance = place.map.appearance
-    if not isinstance(appearance, WhiskerAppearance) or not appearance.metric().likeness.size:
-        return None
-    levels = appearance.stored(frames)[0].astype(int)
-    if levels.shape[1] != len(head.length):
-        return None
-    ground = place.ground._replace(poses=place.map.solution().fit.poses[frames])
-    return contact_map(ground, levels, appearance.layout, appearance.metric().likeness, head, tallest)
 
 
 class ContactMap(NamedTuple):
     """The contacts of N keyframes with D whiskers each.
 
     Attributes:
-        ground: the keyframes. levels: [N, D] of their images. points: [N, D, 2] contact points in the map, m.
-        layout: of the pixels. log_odds: [G, LEVELS, LEVELS], see `log_odds_table`. head, tallest: see
-            `image_points`.
+        ground: the keyframes. levels: [N, D] of their images. layout: of the pixels. log_odds: [G, LEVELS,
+            LEVELS], see `log_odds_table`. head, tallest: see `image_points`.
     """
 
     ground: Ground
     levels: np.ndarray
-    points: np.ndarray
     layout: PixelLayout
     log_odds: np.ndarray
     head: Head
     tallest: float
-
-
-def contact_map(
-    ground: Ground, levels: np.ndarray, layout: PixelLayout, log_odds: np.ndarray, head: Head, tallest: float
-) -> ContactMap:
-    """The contacts of keyframes with images of these levels [N, D]; see `ContactMap`."""
-    points, _ = contact_points(ground.poses, levels, head, tallest)
-    return ContactMap(ground, levels, points, layout, log_odds, head, tallest)
 
 
 def contact_points(
@@ -212,12 +196,14 @@ def contact_signs(made: ContactMap, poses: np.ndarray, levels: np.ndarray, known
         poses: [K, 3] in the map. levels: [K, D] of the images. known: [K] number of the first keyframes of
             the map with which each is compared.
     """
+    ground, found = made.ground, []
+    remembered, _ = contact_points(ground.poses, made.levels, made.head, made.tallest)
     points, touched = contact_points(poses, levels, made.head, made.tallest)
-    found = [
-        (k, *_compare(made, levels[k], points[k], touched[k], near))
-        for k, near in enumerate(_near_keyframes(made.ground, poses, known))
-        if len(near[0])
-    ]
+    for k, pose in enumerate(poses):
+        shift, frame = ground.near(pose, ground.reach, ground.reach_heading)
+        near = shift[frame < known[k]], frame[frame < known[k]]
+        if len(near[0]):
+            found.append((k, *_compare(made, remembered, levels[k], points[k], touched[k], near)))
     if not found:
         empty = np.zeros(0)
         return Signs(np.zeros((0, 2)), empty, empty, empty.astype(int), len(poses))
@@ -226,26 +212,20 @@ def contact_signs(made: ContactMap, poses: np.ndarray, levels: np.ndarray, known
     return Signs(where, evidence, appears, number, len(poses))
 
 
-def _near_keyframes(
-    ground: Ground, poses: np.ndarray, known: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The sector shifts and keyframes with which a robot at each of the poses [K, 3] is compared, among the
-    first `known` [K] keyframes."""
-    found = []
-    for pose, count in zip(poses, known, strict=True):
-        shift, frame = ground.near(pose, ground.reach, ground.reach_heading)
-        found.append((shift[frame < count], frame[frame < count]))
-    return found
-
-
 def _compare(
     made: ContactMap,
+    remembered: np.ndarray,
     level: np.ndarray,
     points: np.ndarray,
     touched: np.ndarray,
     near: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points [n, 2], evidence [n] and appearance [n] of the signs in one image."""
+    """Points [n, 2], evidence [n] and appearance [n] of the signs in one image.
+
+    Args:
+        remembered: [N, D, 2] contact points of the keyframes of the map, m. level: [D] of the image. points
+            [D, 2], touched [D]: see `contact_points`. near: sector shifts and keyframes compared with.
+    """
     # Keyframes [n, 1], their pixels [n, D] with which each pixel of the image is compared, and the log-odds
     # [n, D] that they show the same.
     shift, frame = near[0], near[1][:, None]
@@ -257,7 +237,7 @@ def _compare(
     weight = weight / weight.sum()
     expected = weight[:, None] * (level_heights(made.levels[frame, pixel]) > 0)
     share = expected.sum(axis=0)
-    middle = (expected[..., None] * made.points[frame, pixel]).sum(axis=0) / np.maximum(share, 1e-9)[:, None]
+    middle = (expected[..., None] * remembered[frame, pixel]).sum(axis=0) / np.maximum(share, 1e-9)[:, None]
     was = share > 0.5
     here = touched | was
     where = np.where(touched[:, None], points, middle)

@@ -33,12 +33,18 @@ BESIDE_SHARE = 0.3
 
 
 class Path(NamedTuple):
-    """A pose hypothesis followed through n keyframes: poses [n, 3], m, m, rad; covariances [n, 3, 3]; and
-    log-odds [n] of each keyframe, nat."""
+    """A pose hypothesis followed through n keyframes: poses [n, 3], m, m, rad, and log-odds [n] of each
+    keyframe, nat; `first`: the number of the first one in its session."""
 
     poses: np.ndarray
-    covariances: np.ndarray
     odds: np.ndarray
+    first: int = 0
+
+    def passes(self, ground: Ground, k: int, pose: np.ndarray) -> bool:
+        """Whether keyframe k of the session is at `pose` [3]."""
+        row = k - self.first
+        inside = 0 <= row < len(self.poses)
+        return inside and bool(same_pose(ground, self.poses[row : row + 1], pose)[0])
 
     def odds_beside(self, ground: Ground) -> np.ndarray:
         """[n] the log-odds of each keyframe, nat; of those in a run beside the driven way, less after the
@@ -82,18 +88,17 @@ def follow(
         onwards: the motion into each further keyframe, and the gains [S, N] of its view, None if it shows
             nothing.
     """
-    poses, covariances, gained = [at.pose], [at.covariance], [0.0]
+    poses, gained = [at.pose], [0.0]
     total, inside = 0.0, True
     for moved, gains in onwards:
         at, gain = advance(ground, at, moved, gains)
         log_odds, inside = keyframe_odds(ground, odds, at.pose, gain, inside)
         poses.append(at.pose)
-        covariances.append(at.covariance)
         gained.append(log_odds)
         total += log_odds
         if total < least:
             break
-    return Path(np.array(poses), np.array(covariances), np.array(gained))
+    return Path(np.array(poses), np.array(gained))
 
 
 def keyframe_odds(
@@ -159,7 +164,7 @@ class SessionViews(Checkpointed):
 
     def forget(self, keep: int) -> None:
         """Forgets all but the newest keyframes."""
-        for array in (self.gain, self.shows, self.motion, self.variance):
+        for array in self._growable_arrays().values():
             array.replace(array.rows[max(len(array.rows) - keep, 0) :].copy())
 
     def moved(self, k: int) -> Motion:
@@ -240,7 +245,7 @@ class Hypotheses(Checkpointed):
         if same_pose(ground, self.pose.rows, pose).any():
             return
         at = PoseHypothesis(pose, np.diag(ground.variance))
-        self._add_likely(at, float(views.follow_back(ground, odds, at, MIN_LOG_ODDS).odds.sum()))
+        self.add(at, float(views.follow_back(ground, odds, at, MIN_LOG_ODDS).odds.sum()))
 
     def continue_uncertain(self, ground: Ground, odds: GainOdds, recalled: Recalled) -> None:
         """Adds the recalled pose if it continues another one, which odometry has made uncertain: with the
@@ -256,18 +261,17 @@ class Hypotheses(Checkpointed):
         if len(same):
             self.log_odds.rows[same] = np.maximum(self.log_odds.rows[same], log_odds)
         else:
-            self._add_likely(PoseHypothesis(pose, np.diag(ground.variance)), log_odds)
-
-    def _add_likely(self, at: PoseHypothesis, log_odds: float) -> None:
-        if log_odds >= MIN_LOG_ODDS:
-            self.add(at, log_odds)
+            self.add(PoseHypothesis(pose, np.diag(ground.variance)), log_odds)
 
     def add(self, at: PoseHypothesis, log_odds: float) -> None:
-        """Adds a pose hypothesis of the newest keyframe with the log-odds of the session so far."""
+        """Adds a pose hypothesis of the newest keyframe with the log-odds of the session so far, unless these
+        are too low."""
+        if log_odds < MIN_LOG_ODDS:
+            return
         self.pose.append(at.pose)
         self.covariance.append(at.covariance)
         self.log_odds.append(log_odds)
-        self.states.append(uninterrupted(1)[0])
+        self.states.append(NOTHING_CHANGED)
         self.best.append(0.0)
         self.inside.append(True)
 
@@ -284,7 +288,7 @@ class Hypotheses(Checkpointed):
         return np.argsort(-self.log_odds.rows, kind="stable")
 
     def _keep(self, rows: np.ndarray) -> None:
-        for array in (self.pose, self.covariance, self.log_odds, self.states, self.best, self.inside):
+        for array in self._growable_arrays().values():
             array.replace(array.rows[rows].copy())
 
 
@@ -300,12 +304,9 @@ SHARE = 1e-4
 """Share of keyframes at which such a stretch begins; each length is as likely as another."""
 
 
-def uninterrupted(count: int) -> np.ndarray:
-    """[count, 1 + LONGEST] log-odds of poses at which all views agreed: of agreement, and of a changed
-    stretch that lasts 1, 2, ... more keyframes."""
-    states = np.full((count, 1 + LONGEST), -np.inf)
-    states[:, 0] = 0.0
-    return states
+NOTHING_CHANGED = np.array([0.0] + [-np.inf] * LONGEST)
+"""Log-odds of a pose at which all views agreed: of agreement, and of a changed stretch that lasts 1, 2, ...
+more keyframes."""
 
 
 def continue_states(states: np.ndarray, odds: np.ndarray, elsewhere: np.ndarray) -> np.ndarray:

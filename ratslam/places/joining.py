@@ -3,29 +3,27 @@
 A placement of one piece in the other has to explain all its views, be more likely than any other by far,
 and be found from either side. Its keyframes on common ground then give closure sequences, which are
 selected together with all others; the pieces are joined if most of their evidence is accepted. Anchoring
-whole sessions: Kim et al. 2010. A solved piece lies on the ground nearly as a rigid body (`MapTraverse`):
-where the robot comes back from a way that the other map does not have, its pose follows from all places
-confirmed so far, and not from a long way of odometry.
+whole sessions: Kim et al. 2010.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from ratslam.mapping.closure_selection import MapHypotheses
-from ratslam.mapping.ground import NO_MOTION, GainOdds, Ground, Motion, PoseHypothesis, advance
+from ratslam.mapping.ground import Ground, Motion
 from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.mapping.loop_closures import Candidate, Verdict
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import MapSolution, selected_solution, solved_map
 from ratslam.mapping.optimizer import MapCovariance
-from ratslam.places.hypotheses import Path, keyframe_odds
-from ratslam.places.placement import Comparison, Stretch, Traverse, closures_along, find_placements
-from ratslam.recall.memory import Memory
+from ratslam.places.hypotheses import Path
+from ratslam.places.map_views import MapViews
+from ratslam.places.placement import Comparison, Traverse, closures_along, find_placements
 from tactile.base.se2 import between, compose, fit_rigid_motion, inverse, wrap
 
 LOG_ODDS = 15.0
@@ -45,22 +43,6 @@ STANDING = 0.5
 
 Stretches = tuple[int, ...]
 """Numbers of the stretches of keyframes, each from one beginning of a piece to the next, that a piece has."""
-
-
-class Views(Protocol):
-    """Compares the views of a map's keyframes, numbered among all ever taken."""
-
-    def freeze(self, frames: np.ndarray, poses: np.ndarray) -> Memory:
-        """The memory of keyframes `frames` [N] at `poses` [N, 3]."""
-
-    def ground(self, poses: np.ndarray) -> Ground:
-        """Keyframes at `poses` [N, 3] as ground."""
-
-    def odds(self, frames: np.ndarray, poses: np.ndarray) -> GainOdds:
-        """The log-odds of gains on the ground of keyframes `frames` [N] at `poses` [N, 3]."""
-
-    def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
-        """The views of keyframes `frames` [n], moved by `motion` [n, 3] into each."""
 
 
 class Join(NamedTuple):
@@ -107,7 +89,7 @@ class _Found(NamedTuple):
 
 def join_all(
     map: KeyframeMap,
-    views: Views,
+    views: MapViews,
     tried: set[tuple[Stretches, Stretches]],
     report: Callable[[str], None] = lambda _: None,
 ) -> list[Join]:
@@ -130,7 +112,7 @@ def join_all(
 
 
 def _join_some(
-    map: KeyframeMap, views: Views, tried: set[tuple[Stretches, Stretches]], report: Callable[[str], None]
+    map: KeyframeMap, views: MapViews, tried: set[tuple[Stretches, Stretches]], report: Callable[[str], None]
 ) -> Join | None:
     """Joins the first two pieces that can be joined, of those that were not tried yet."""
     graph = map.kept_keyframes()
@@ -148,7 +130,7 @@ def _join_some(
     return None
 
 
-def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) -> Join | None:
+def _join(map: KeyframeMap, views: MapViews, one: np.ndarray, other: np.ndarray) -> Join | None:
     """Joins two pieces of keyframes `one` [N] and `other` [n] if the evidence suffices."""
     graph = map.kept_keyframes()
     found = _place(map, views, one, other)
@@ -168,7 +150,8 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
     trial.pose.rows[other] = compose(found.motion, trial.pose.rows[other])
     # The map with these closures, selected together with all others where sequences are selected.
     first, selected = log.sequences, None
-    _add(log, sequences)
+    for sequence in sequences:
+        log.add_accepted(sequence)
     trial.optimise(log)
     if trial.config.select_every:
         hypotheses = MapHypotheses()
@@ -194,7 +177,7 @@ def _join(map: KeyframeMap, views: Views, one: np.ndarray, other: np.ndarray) ->
     )  # fmt: skip
 
 
-def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
+def _place(map: KeyframeMap, views: MapViews, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
     """The placement of keyframes `frames` [n] on the ground of those `onto` [N] and of all merged with these,
     if it is beyond doubt."""
     graph, archive = map.kept_keyframes(), map.archive
@@ -203,7 +186,7 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
     poses = archive.poses(graph.pose.rows)[every]
     ground, odds = views.ground(poses), views.odds(every, poses)
     motions = _motions(graph, own)
-    session = MapTraverse(_compare(graph, views, every, poses, frames), own, motions, MIN_LOG_ODDS)
+    session = Traverse(_compare(graph, views, every, poses, frames), motions, MIN_LOG_ODDS, own)
     paths = []
     for path in find_placements(ground, odds, session):
         # No evidence against it at headings that the other session never drove, and less in runs beside its
@@ -227,7 +210,7 @@ def _place(map: KeyframeMap, views: Views, onto: np.ndarray, frames: np.ndarray)
 
 
 def _compare(
-    graph: KeyframeGraph, views: Views, taken: np.ndarray, poses: np.ndarray, frames: np.ndarray
+    graph: KeyframeGraph, views: MapViews, taken: np.ndarray, poses: np.ndarray, frames: np.ndarray
 ) -> Comparison:
     """The views of keyframes `frames` [n] on those numbered `taken` [M] of all, at `poses` [M, 3]."""
     motion = np.array([moved.motion for moved in _motions(graph, graph.pose.rows[frames])])
@@ -247,7 +230,7 @@ def _is_small(ground: Ground, apart: np.ndarray) -> bool:
     return bool(far < 2 * ground.reach and turned < ground.reach_heading)
 
 
-def _closures(graph: KeyframeGraph, views: Views, found: _Found) -> list[list[Candidate]]:
+def _closures(graph: KeyframeGraph, views: MapViews, found: _Found) -> list[list[Candidate]]:
     """Closure sequences along a placement, with keyframes that are not merged."""
     poses = graph.pose.rows[found.onto]
     compared = _compare(graph, views, graph.taken.rows[found.onto], poses, found.frames)
@@ -265,7 +248,7 @@ def _closures(graph: KeyframeGraph, views: Views, found: _Found) -> list[list[Ca
         if frame < other:
             frame, other, turn = other, frame, -turn
         shift = round(-turn / angle) if angle else 0
-        if np.cos(angle) < 0:  # half a turn is the same either way
+        if graph.half_turns:  # half a turn is the same either way
             shift = abs(shift)
         posterior = float(1 / (1 + np.exp(-match.gain)))
         sequences[-1].append(Candidate(frame, other, shift, posterior, match.gain))
@@ -273,82 +256,13 @@ def _closures(graph: KeyframeGraph, views: Views, found: _Found) -> list[list[Ca
     return [sequence for sequence in sequences if len(sequence) >= graph.config.min_length]
 
 
-def _add(log: ClosureLog, sequences: list[list[Candidate]]) -> None:
-    for sequence in sequences:
-        for k, candidate in enumerate(sequence):
-            log.add(candidate, k > 0)
-        log.judge(log.sequences - 1, Verdict.ACCEPTED)
-
-
 def _take_up(map: KeyframeMap, solution: MapSolution, sequences: list[list[Candidate]]) -> None:
     graph, log = map.kept_keyframes(), map.log
     for sequence in sequences:
-        for k, candidate in enumerate(sequence):
-            map.archive.add(candidate, k > 0, graph)
-    _add(log, sequences)
+        map.add_accepted(sequence)
     log.follow(solution.log)
     graph.pose.rows[:] = solution.fit.poses
     graph.bias, graph.turn_error = solution.fit.bias, solution.fit.turn_error
     graph.cut.replace(solution.cut.rows)
     graph.place_pieces(log)
     map.selection.hypotheses.begin(graph.fit(), log.sequences)
-
-
-UNCONFIRMED = 6
-"""Keyframes without evidence for a pose, after which it is that of the piece as a rigid body."""
-TOGETHER = 20
-"""Least number of keyframes with evidence for their poses that one rigid motion brings there."""
-
-
-class MapTraverse(NamedTuple):
-    """A solved piece of n keyframes over a ground.
-
-    Attributes:
-        views: compared with the ground. poses: [n, 3] in the piece, m, m, rad. motions: [n] into each
-            keyframe, the first one's not used. least: log-odds of the way to either end below which a
-            placement is dropped.
-    """
-
-    views: Comparison
-    poses: np.ndarray
-    motions: list[Motion]
-    least: float
-
-    def follow(self, ground: Ground, odds: GainOdds, k: int, pose: np.ndarray) -> Stretch:
-        """The path with keyframe k at `pose` [3]: of the whole piece as a rigid body if many places agree on
-        one; else as odometry leads, as far as it is likely enough."""
-        way = Traverse(self.views, self.motions, self.least).follow(ground, odds, k, pose)
-        confirmed = np.flatnonzero(way.path.odds > 0)
-        own, found = self.poses[way.first + confirmed], way.path.poses[confirmed]
-        together = _largest_rigid_part(ground, own, found)
-        if together.sum() < TOGETHER:
-            return way
-        moved = fit_rigid_motion(own[together], found[together])
-        return Stretch(0, self._along(ground, odds, moved))
-
-    def _along(self, ground: Ground, odds: GainOdds, moved: np.ndarray) -> Path:
-        """The path of the piece moved by `moved` [3], corrected by the views."""
-        rigid, loose = compose(moved, self.poses), np.diag(ground.variance)
-        at, inside, unconfirmed = PoseHypothesis(rigid[0], loose), False, UNCONFIRMED
-        poses, covariances, gained = np.empty_like(rigid), np.empty((len(rigid), 3, 3)), np.zeros(len(rigid))
-        for k, motion in enumerate(self.motions):
-            if unconfirmed >= UNCONFIRMED:
-                at, motion = PoseHypothesis(rigid[k], loose), NO_MOTION
-            at, gain = advance(ground, at, motion, self.views.gains(k))
-            gained[k], inside = keyframe_odds(ground, odds, at.pose, gain, inside)
-            poses[k], covariances[k] = at
-            unconfirmed = 0 if gained[k] > 0 else unconfirmed + 1
-        return Path(poses, covariances, gained)
-
-
-def _largest_rigid_part(ground: Ground, own: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """[n] bool: the most poses `own` [n, 3] that one rigid motion brings to within the ground's reaches of
-    those `found` [n, 3]."""
-    best = np.zeros(len(own), bool)
-    for k in range(len(own)):
-        apart = between(compose(compose(found[k], inverse(own[k])), own), found)
-        near = np.hypot(*apart[:, :2].T) < ground.reach
-        together = near & (np.abs(wrap(apart[:, 2])) < ground.reach_heading)
-        if together.sum() > best.sum():
-            best = together
-    return best

@@ -236,7 +236,7 @@ class Localiser(Checkpointed, Map):
     def _moved(self) -> Motion:
         """The motion since the newest keyframe without the systematic errors that the map knows."""
         graph, (motion, length, turn) = self.place.graph, self._travel
-        variance = graph.odometry_variance(np.array([length]), np.array([turn]))[0]
+        variance = graph.odometry_variance(length, turn)
         variance[2] *= HEADING_NOISE * graph.heading_noise.further_factor
         return Motion(graph.correct(motion, length), variance)
 

@@ -29,7 +29,7 @@ from ratslam.mapping.ground import (
 )
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog
-from ratslam.mapping.piece_ties import Tie
+from ratslam.mapping.map import Tie
 from ratslam.network.pose_cells import Belief, Network
 from ratslam.places.localiser import compare_with_itself
 from ratslam.places.placement import Comparison, Traverse, closures_along, find_placements

@@ -98,16 +98,11 @@ def travel_graph(
         expected = seconds * (traversals + 2) / (traversals + 1)
         data |= {"length": length, "seconds": seconds, "expected": expected}
     if obstacles is not None and len(obstacles):
-        graph.remove_edges_from(blocked_links(graph, obstacles, standoff))
+        links = list(graph.edges())
+        ends = np.array([[position(graph, a), position(graph, b)] for a, b in links]).reshape(-1, 2, 2)
+        near = segment_distances(obstacles, ends[:, 0], ends[:, 1]).min(axis=0) < standoff
+        graph.remove_edges_from([link for link, blocked in zip(links, near, strict=True) if blocked])
     return graph
-
-
-def blocked_links(graph: networkx.Graph, obstacles: np.ndarray, standoff: float) -> list[tuple[int, int]]:
-    """The edges that pass within a distance (m) of one of the points [n, 2]."""
-    edges = list(graph.edges())
-    ends = np.array([[position(graph, a), position(graph, b)] for a, b in edges]).reshape(-1, 2, 2)
-    near = segment_distances(obstacles, ends[:, 0], ends[:, 1]).min(axis=0) < standoff
-    return [edge for edge, blocked in zip(edges, near, strict=True) if blocked]
 
 
 def find_way(graph: networkx.Graph, start: int, goals: Sequence[int], mode: Mode = "time") -> Way:

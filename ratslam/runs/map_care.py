@@ -18,7 +18,7 @@ from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import Obstacle
 from ratslam.methods.recall import RecallBackend
 from ratslam.places.crop import crop_map
-from ratslam.places.difference import MapContent, difference, keyframe_content
+from ratslam.places.difference import difference, keyframe_content
 from ratslam.runs.folder_change import change_folder, finish_change, unfinished_change
 from ratslam.runs.map_results import rewrite_results
 from ratslam.runs.saved_map import NAME, SavedMap, map_file, write_map
@@ -113,8 +113,8 @@ def map_difference(first: SavedMap, second: SavedMap) -> dict[str, Any]:
         else:
             names = [f"{saved.recording} {step}".encode() for step in range(saved.steps)]
             path = made.trajectory() if saved.steps else np.zeros((0, 3))
-            contents.append(MapContent(path, names, made.closures()))
-    found = difference(*contents)._asdict()
+            contents.append((path, names, made.closures()))
+    found = difference(*contents)
     settings = [flat_settings(saved.config.model_dump(mode="json")) for saved in (first, second)]
     keys = sorted(settings[0].keys() | settings[1].keys())
     pairs = {key: [one.get(key) for one in settings] for key in keys}

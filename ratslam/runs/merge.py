@@ -16,9 +16,10 @@ from evaluation.artifacts.run_reader import MERGE_REPORT as REPORT
 from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.recall import RecallBackend
+from ratslam.places.difference import overlap, remembered
 from ratslam.places.joining import Join, Stretches, join_all
 from ratslam.places.map_views import MapViews
-from ratslam.places.union import Overlap, overlap, remembered, renew_experiences, unite
+from ratslam.places.union import renew_experiences, unite
 from ratslam.runs.estimate import START
 from ratslam.runs.map_results import write_merged_results
 from ratslam.runs.map_settings import assignments, differing_settings, settings_of_map
@@ -234,29 +235,31 @@ def _check_sessions(maps: Sequence[SavedMap]) -> None:
     for (first, seen), (second, again) in combinations(zip(maps, keyframes, strict=True), 2):
         common = overlap(seen, again)
         if common is not None:
+            count, held, repeated = common
             found = (
-                f"its steps {_span(common.other)} are the session that {first.path} holds in its steps "
-                f"{_span(common.one)}: {common.keyframes} keyframes are equal to the bit"
+                f"its steps {_span(repeated)} are the session that {first.path} holds in its steps "
+                f"{_span(held)}: {count} keyframes are equal to the bit"
             )
-            whole = [len(first) == common.keyframes for first, _ in (seen, again)]
-            raise InputError(str(second.path), found, OTHERS, _cure(first.path, second, common, whole))
+            whole = [len(first) == count for first, _ in (seen, again)]
+            raise InputError(str(second.path), found, OTHERS, _cure(first.path, second, repeated, whole))
         if first.recording and first.recording == second.recording:
             found = f"its last session is of the same recording ({first.source.name}) as that of {first.path}"
             raise InputError(str(second.path), found, OTHERS, "leave one of them out")
 
 
-def _cure(first: Path, second: SavedMap, common: Overlap, whole: Sequence[bool]) -> str:
+def _cure(first: Path, second: SavedMap, span: tuple[int, int], whole: Sequence[bool]) -> str:
     """How to count a session once.
 
     Args:
-        whole: whether all of the first and of the second map is in the other one.
+        span: its first and last step in the second map. whole: whether all of the first and of the second map
+            is in the other one.
     """
     if all(whole):
         return "leave one of them out: each holds all of the other"
     for path, contained in zip((first, second.path), whole, strict=True):
         if contained:
             return f"leave out {path}, all of which is in the other map"
-    begin, end = common.other
+    begin, end = span
     rest = f"--steps :{begin}" if begin > second.steps - 1 - end else f"--steps {end + 1}:"
     crop = f"ratslam map crop {second.path} {rest} -o rest.npz"
     return f"leave one of them out, or merge the rest of one of them: `{crop}`"

@@ -133,8 +133,8 @@ def test_a_sequence_that_has_lost_keyframes_keeps_its_log_odds(judged):
 def test_an_unlikely_sequence_waits_for_a_selection(monkeypatch, judged, select_every, odds, accepted):
     graph, _ = judged
     graph.config = KeyframeMapConfig(select_every=select_every)
-    judge = "ratslam.mapping.acceptance.judge_newest"
-    monkeypatch.setattr(judge, lambda *map_and_sequence: odds)
+    judge = "ratslam.mapping.acceptance.judge_sequences"
+    monkeypatch.setattr(judge, lambda *map_and_sequences: np.array([odds]))
     log = closed(CLEAN[:1])
     log.judge(0, Verdict.OPEN)
     frame, match, shift, _ = log.members(0)[-1].tolist()

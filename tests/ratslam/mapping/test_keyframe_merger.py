@@ -167,9 +167,9 @@ def test_the_stops_are_what_they_are_named(early):
     found, whole = stopped()
     merged = {name: len(drive.rows) < STOPS[name] for name, drive in found.items()}
     assert merged == {name: name != "before any merge" for name in STOPS}
-    selecting = {name for name, drive in found.items() if drive.map.merger.archive_selection.busy}
+    selecting = {name for name, drive in found.items() if drive.map.merger.archive_selection.job.busy}
     assert selecting == {"selecting", "due"}
-    assert not whole.map.merger.archive_selection.busy
+    assert not whole.map.merger.archive_selection.job.busy
     assert found["merge due"].map.merger.merge_due
     assert not found["between merges"].map.merger.merge_due
 

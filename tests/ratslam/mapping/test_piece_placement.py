@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.mapping.keyframe_graph import APART, PiecePlacement, number_pieces, piece_start
+from ratslam.mapping.keyframe_graph import APART, number_pieces, piece_start, placed_pieces
 from tactile.base.se2 import between, compose, wrap
 
 CELL = 0.2
@@ -30,7 +30,7 @@ def maps(draw):
     i, j = np.array(pairs, int).reshape(-1, 2).T
     # A closure claims a position, so the two keyframes of each are put at one place of the truth.
     turn = random.uniform(-np.pi, np.pi, len(i))
-    return poses, PiecePlacement(begins, i, j, turn, CELL)
+    return poses, (begins, i, j, turn)
 
 
 def between_first(poses, stretch):
@@ -41,13 +41,13 @@ def between_first(poses, stretch):
 @law
 @given(maps())
 def test_pieces_keep_their_shape_and_lie_apart_unless_they_are_joined(found):
-    poses, placement = found
-    placed = placement.place(poses)
-    stretch = np.cumsum(placement.begins)
+    poses, joints = found
+    placed = placed_pieces(poses, *joints, CELL)
+    stretch = np.cumsum(joints[0])
     shape = between_first(placed, stretch) - between_first(poses, stretch)
     shape[:, 2] = wrap(shape[:, 2])
     assert np.abs(shape).max() < 1e-9
-    piece = number_pieces(placement.begins, np.column_stack([placement.j, placement.i]))
+    piece = number_pieces(joints[0], np.column_stack([joints[2], joints[1]]))
     for number in np.unique(piece):
         at = np.flatnonzero(piece == number)[0]
         assert np.allclose(placed[at], piece_start(int(stretch[at]), CELL) if number else poses[0])
@@ -58,20 +58,20 @@ def test_pieces_keep_their_shape_and_lie_apart_unless_they_are_joined(found):
 @law
 @given(maps())
 def test_placing_twice_changes_nothing_more(found):
-    poses, placement = found
-    placed = placement.place(poses)
-    assert np.abs(placement.place(placed) - placed).max() < 1e-9
+    poses, joints = found
+    placed = placed_pieces(poses, *joints, CELL)
+    assert np.abs(placed_pieces(placed, *joints, CELL) - placed).max() < 1e-9
 
 
 @law
 @given(maps(), st.integers(0, 2**32 - 1))
 def test_one_closure_brings_two_pieces_to_where_it_claims(found, seed):
-    poses, placement = found
-    stretch = np.cumsum(placement.begins)
+    poses, joints = found
+    stretch = np.cumsum(joints[0])
     random = np.random.default_rng(seed)
     i, j = (int(random.integers(len(stretch))) for _ in range(2))
     turn = float(random.uniform(-3, 3))
-    placed = placement._replace(i=np.array([i]), j=np.array([j]), turn=np.array([turn])).place(poses)
+    placed = placed_pieces(poses, joints[0], np.array([i]), np.array([j]), np.array([turn]), CELL)
     if stretch[i] != stretch[j]:
         error = placed[j] - placed[i] - (0.0, 0.0, turn)
         assert np.abs([*error[:2], wrap(error[2])]).max() < 1e-9
@@ -80,5 +80,4 @@ def test_one_closure_brings_two_pieces_to_where_it_claims(found, seed):
 def test_a_map_without_beginnings_is_left_as_it_is():
     poses = np.random.default_rng(0).normal(0, 1, (5, 3))
     none = np.zeros(0, int)
-    placement = PiecePlacement(np.zeros(5, bool), none, none, np.zeros(0), CELL)
-    assert placement.place(poses) is poses
+    assert placed_pieces(poses, np.zeros(5, bool), none, none, np.zeros(0), CELL) is poses

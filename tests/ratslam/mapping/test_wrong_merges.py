@@ -82,14 +82,14 @@ def test_the_selection_on_the_unmerged_keyframes_restores_them(monkeypatch):
 def test_the_map_is_right_as_soon_as_it_is_restored(monkeypatch):
     monkeypatch.setattr(archive, "FIRST", BEGUN)
     drive = Drive(ROUTE, **MERGED).go(BEGUN)
-    assert drive.map.merger.archive_selection.busy
-    while drive.map.merger.archive_selection.busy:
+    assert drive.map.merger.archive_selection.job.busy
+    while drive.map.merger.archive_selection.job.busy:
         assert drive.map.log.verdict(0) == Verdict.ACCEPTED
         assert gap(drive.map.online_trajectory()) < CELL
         rows = len(drive.rows)
         drive.go(drive.steps + 1)
         # Nothing is merged meanwhile.
-        assert len(drive.rows) == rows + 1 or not drive.map.merger.archive_selection.busy
+        assert len(drive.rows) == rows + 1 or not drive.map.merger.archive_selection.job.busy
     assert drive.map.log.verdict(0) == Verdict.OPEN
     assert gap(drive.map.online_trajectory()) > 2 * CELL
     assert len(drive.map.online_trajectory()) == drive.steps

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.mapping.ground import Ground
-from ratslam.places.change import ContactMap, contact_map, contact_points, contact_signs
+from ratslam.places.change import ContactMap, contact_points, contact_signs
 from ratslam.recall.whisker_likelihood import PRIOR, estimate_background, log_odds_table, pixel_layout
 from tactile.whisker_geometry import HeadConfig, ur10_head
 
@@ -34,7 +34,7 @@ def corridor(reversed: bool = False) -> ContactMap:
     varied = np.concatenate([levels, np.roll(levels, 1, axis=1), np.zeros_like(levels)])
     table = log_odds_table(estimate_background(varied, LAYOUT.group), PRIOR)
     ground = Ground(poses, np.array([0.0, -np.pi]), 0.06, 0.3, np.full(3, 1e-4))
-    return contact_map(ground, levels, LAYOUT, table, HEAD, TALLEST)
+    return ContactMap(ground, levels, LAYOUT, table, HEAD, TALLEST)
 
 
 def drive(count: int = 20) -> np.ndarray:

@@ -52,9 +52,9 @@ def test_a_crop_of_everything_changes_nothing(made) -> None:
     before, arrays = keyframe_content(made), made.arrays()
     rows, path = cropped(made, np.ones(END, bool))
     found = difference(before, keyframe_content(made))
-    assert (found.common, found.removed, found.added) == (END, 0, 0)
-    assert (found.closures_removed, found.closures_added) == (0, 0)
-    assert found.closures_common == len(made.closures()) > 40
+    assert (found["common"], found["removed"], found["added"]) == (END, 0, 0)
+    assert (found["closures_removed"], found["closures_added"]) == (0, 0)
+    assert found["closures_common"] == len(made.closures()) > 40
     assert np.abs(made.trajectory() - path).max() < 1e-9
     assert made.arrays().keys() == arrays.keys()
     assert rows.left.all()

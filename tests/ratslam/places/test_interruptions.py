@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.places.hypotheses import LONGEST, SHARE, continue_states, summed, uninterrupted
+from ratslam.places.hypotheses import LONGEST, NOTHING_CHANGED, SHARE, continue_states, summed
 
 NOWHERE = np.zeros(1)
 
 
 def follow(odds: list[float], elsewhere: float = 0.0) -> np.ndarray:
     """The log-odds after each keyframe."""
-    states, found = uninterrupted(1), []
+    states, found = NOTHING_CHANGED[None], []
     for one in odds:
         states = continue_states(states, np.array([one]), np.array([elsewhere]))
         found.append(summed(states)[0])
@@ -44,7 +44,7 @@ def test_views_of_another_place_do_not_pass_for_changed_ground() -> None:
 
 def test_poses_do_not_depend_on_each_other() -> None:
     odds = np.random.default_rng(0).normal(0.0, 3.0, (30, 4))
-    together = uninterrupted(4)
+    together = np.tile(NOTHING_CHANGED, (4, 1))
     for row in odds:
         together = continue_states(together, row, np.zeros(4))
     alone = [follow(column.tolist())[-1] for column in odds.T]

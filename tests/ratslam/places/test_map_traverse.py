@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.mapping.ground import Motion
-from ratslam.places.joining import TOGETHER, MapTraverse
-from ratslam.places.placement import Traverse, find_placements
+from ratslam.places.placement import TOGETHER, Traverse, find_placements
 from tactile.base.se2 import compose
 from tests.ratslam.places.test_placement import COUNT, MOVED, ODDS, compared, ground_of, ring
 
@@ -17,7 +16,7 @@ HELD = np.setdiff1d(np.arange(COUNT), GAP)
 MIN_LOG_ODDS = -60.0
 
 
-def half_known(recalled: np.ndarray, turn: float) -> MapTraverse:
+def half_known(recalled: np.ndarray, turn: float) -> Traverse:
     """The whole ring over ground without the gap; its motions lead astray in the gap.
 
     Args:
@@ -29,7 +28,7 @@ def half_known(recalled: np.ndarray, turn: float) -> MapTraverse:
     for k in GAP:
         astray = session.motions[k].motion + np.array([0.0, 0.0, turn])
         session.motions[k] = Motion(astray, session.motions[k].variance)
-    return MapTraverse(session.views, ring(), session.motions, MIN_LOG_ODDS)
+    return Traverse(session.views, session.motions, MIN_LOG_ODDS, ring())
 
 
 def error(poses: np.ndarray, rows: slice) -> float:
@@ -51,7 +50,7 @@ def test_a_piece_comes_back_to_the_ground_where_it_is_as_a_rigid_body(turn: floa
 def test_the_whole_piece_is_placed_from_any_keyframe_in_the_same_way() -> None:
     ground = ground_of(compose(MOVED, ring()[HELD]))
     piece = half_known(np.zeros(COUNT, int), 0.0)
-    one, other = (piece.follow(ground, ODDS, k, compose(MOVED, ring()[k])).path for k in (20, 180))
+    one, other = (piece.follow(ground, ODDS, k, compose(MOVED, ring()[k])) for k in (20, 180))
     np.testing.assert_allclose(one.poses, other.poses, atol=1e-3)
     np.testing.assert_array_equal(one.odds, other.odds)
 
@@ -60,10 +59,10 @@ def test_a_few_confirmed_places_do_not_make_a_rigid_body() -> None:
     place = np.where(np.arange(COUNT) < TOGETHER - 1, np.arange(COUNT), -1)
     session = compared(place, place, COUNT)
     ground = ground_of(compose(MOVED, ring()))
-    piece = MapTraverse(session.views, ring(), session.motions, MIN_LOG_ODDS)
+    piece = Traverse(session.views, session.motions, MIN_LOG_ODDS, ring())
     pose = compose(MOVED, ring()[0])
     way = Traverse(session.views, session.motions, MIN_LOG_ODDS).follow(ground, ODDS, 0, pose)
     found = piece.follow(ground, ODDS, 0, pose)
     assert found.first == way.first
-    np.testing.assert_array_equal(found.path.odds, way.path.odds)
-    assert len(found.path.poses) < COUNT
+    np.testing.assert_array_equal(found.odds, way.odds)
+    assert len(found.poses) < COUNT

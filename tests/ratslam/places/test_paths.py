@@ -67,7 +67,7 @@ def test_evidence_for_a_path_counts_half_where_it_comes_again(seed: int, laps: i
     random = np.random.default_rng(seed)
     lap = LOOP.ground.poses
     odds = random.normal(0.5, 1.0, laps * len(lap))
-    path = Path(np.tile(lap, (laps, 1)), np.zeros((len(odds), 3, 3)), odds)
+    path = Path(np.tile(lap, (laps, 1)), odds)
     counted = path.independent_odds(LOOP.ground)
     first = len(lap) - AGAIN
     np.testing.assert_array_equal(counted[:first], odds[:first])
@@ -80,7 +80,7 @@ def test_a_robot_that_turns_where_it_stands_or_drives_on_visits_nothing_again() 
     odds = np.full(AGAIN, 1.0)
     poses = np.tile(LOOP.ground.poses[3], (AGAIN, 1))
     poses[:, 2] += np.arange(AGAIN)
-    path = Path(poses, np.zeros((AGAIN, 3, 3)), odds)
+    path = Path(poses, odds)
     np.testing.assert_array_equal(path.independent_odds(LOOP.ground), odds)
 
 
@@ -89,7 +89,7 @@ def test_evidence_against_a_path_beside_the_way_counts_less_after_the_first_keyf
     lap = LOOP.ground.poses
     across = compose(lap[3:8], np.array([0.0, 0.0, np.pi / 2]))
     poses = np.concatenate([lap[:3], across, lap[8:11]])
-    counted = count(Path(poses, np.zeros((11, 3, 3)), np.full(11, -1.0)), LOOP.ground)
+    counted = count(Path(poses, np.full(11, -1.0)), LOOP.ground)
     np.testing.assert_array_equal(counted, [-1.0] * 4 + [-BESIDE_SHARE] * 4 + [-1.0] * 3)
 
 
@@ -97,12 +97,12 @@ def test_headings_are_undriven_on_the_way_where_nobody_drove_there_and_faced_so(
     driven, away = LOOP.ground.poses[3], np.array([50.0, 0.0, 0.0])
     across = compose(driven, np.array([0.0, 0.0, np.pi / 2]))
     poses = np.stack([driven, across, driven + away, across + away])
-    path = Path(poses, np.zeros((4, 3, 3)), np.full(4, -1.0))
+    path = Path(poses, np.full(4, -1.0))
     assert path.at_undriven_headings(LOOP.ground).tolist() == [False, True, False, False]
 
 
 def test_evidence_for_a_path_counts_beside_the_way_and_where_it_comes_again() -> None:
     poses = np.tile(compose(LOOP.ground.poses[3], np.array([0.0, 0.0, np.pi / 2])), (2 * AGAIN, 1))
     odds = np.full(len(poses), 0.5)
-    counted = Path(poses, np.zeros((len(poses), 3, 3)), odds).odds_beside(LOOP.ground)
+    counted = Path(poses, odds).odds_beside(LOOP.ground)
     np.testing.assert_array_equal(counted, odds)

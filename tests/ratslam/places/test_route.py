@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from ratslam.places.route import (
     NoWay,
     Travel,
-    blocked_links,
     experiences_near,
     find_way,
     nearest_experience,
+    position,
     travel_graph,
 )
+from tactile.base.se2 import segment_distances
 
 TRAVEL = Travel(speed=0.05, turn_rate=0.5, turn_radius=0.02)
 
@@ -81,10 +82,10 @@ def test_the_temporal_map_is_descended_without_a_rise(seed, start, goal):
 def test_no_way_passes_an_obstacle(seed):
     experiences, standoff = random_map(seed), 0.05
     obstacle = np.random.default_rng(seed).uniform(0, 1, (2, 2))
-    graph = travel_graph(experiences, TRAVEL, obstacle, standoff)
-    assert not blocked_links(graph, obstacle, standoff)
-    free = travel_graph(experiences, TRAVEL)
-    assert graph.number_of_edges() == free.number_of_edges() - len(blocked_links(free, obstacle, standoff))
+    graph, free = travel_graph(experiences, TRAVEL, obstacle, standoff), travel_graph(experiences, TRAVEL)
+    ends = np.array([[position(free, a), position(free, b)] for a, b in free.edges()])
+    clear = segment_distances(obstacle, ends[:, 0], ends[:, 1]).min(axis=0) >= standoff
+    assert set(graph.edges()) == {link for link, keep in zip(free.edges(), clear, strict=True) if keep}
 
 
 def test_a_trusted_link_is_preferred_to_a_doubtful_one_of_the_same_length():
