@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator
-from contextlib import closing
 from itertools import chain
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from robot.recordings.bags.bag import container_fault
 from robot.recordings.cdr import TRUTH, Event
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.mcap_scanner import UNCLOSED, McapScanner, is_foreign
-from robot.recordings.mcap_writer import McapWriter, Recorder
+from robot.recordings.mcap_writer import Recorder
 from robot.recordings.sanity_checks import clock_errors, first_error, nonfinite_errors, view_errors
 from robot.sources.input_files import digest_of_files, raise_errors, require_file
 from robot.sources.source import ClosedSource, Sample, Source, rate_of
@@ -34,7 +33,6 @@ class Recording(ClosedSource):
     Attributes:
         truncated: whether the file ends early; its first `length` samples are readable.
         warning: that sentence, or ''.
-        created_by: program and version that recorded it.
         events: events of a live session: faults, discontinuities, dropped images.
         info: devices, world and origin, as stored; `raw_whiskers` is set from the readings.
 
@@ -65,7 +63,6 @@ class Recording(ClosedSource):
             raise _unreadable_recording_error(scanner)
         self.events = tuple(events)
         self.view_shape, self.whiskers = description.view_shape, description.whiskers
-        self.created_by = description.created_by
         self.info = description.info.model_copy(update={"raw_whiskers": raw_whiskers})
         self.length = scanner.count
         self.truncated = bool(scanner.broken)
@@ -121,13 +118,15 @@ class Recording(ClosedSource):
 
 def record_source(source: Source, path: Path) -> int:
     """Write all samples of a source to a new recording; returns their number."""
-    shape, rate = source.view_shape, source.rate_hz
-    with Recorder(
-        path, view_shape=shape, whiskers=source.whiskers, rate_hz=rate, info=source.info
-    ) as recorder:
+    with _recorder_like(source, path) as recorder:
         for sample in source:
             recorder.write(sample)
         return recorder.count
+
+
+def _recorder_like(source: Source, path: Path) -> Recorder:
+    shape, whiskers, rate, info = source.view_shape, source.whiskers, source.rate_hz, source.info
+    return Recorder(path, view_shape=shape, whiskers=whiskers, rate_hz=rate, info=info)
 
 
 def recover(path: Path, out: Path) -> tuple[int, str]:
@@ -151,14 +150,11 @@ def recover(path: Path, out: Path) -> tuple[int, str]:
     described = scanner.description
 
     def write(path: Path) -> None:
-        shape, whiskers, rate, _, info = described
-        with closing(
-            McapWriter(path, view_shape=shape, whiskers=whiskers, rate_hz=rate, info=info)
-        ) as writer:
+        with _recorder_like(described, path) as recorder:
             for entry in chain([first], entries):
                 if entry.truth is not None:
-                    writer.append(TRUTH, entry.time, entry.truth)
-                writer.append(entry.name, entry.time, entry.message)
+                    recorder.append(TRUTH, entry.time, entry.truth)
+                recorder.append(entry.name, entry.time, entry.message)
         if not scanner.count:
             raise _unreadable_recording_error(scanner)
         flush_to_disk(path)

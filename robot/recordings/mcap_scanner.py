@@ -23,7 +23,6 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from robot.drivers.head.decoder import Frames, FrameWindow, assemble_cycle, empty_frames
 from robot.recordings.cdr import (
-    ARM,
     CUT,
     FRAMES,
     MAX_NUMBERS,
@@ -34,14 +33,9 @@ from robot.recordings.cdr import (
     Event,
     Malformed,
     decode,
-    decode_cut,
-    decode_event,
-    decode_frames,
-    decode_states,
-    decode_truth,
 )
 from robot.sources.input_files import unreadable_error
-from robot.sources.source import Sample, SourceInfo
+from robot.sources.source import Sample, SourceDescription, SourceInfo
 from tactile.base.bounded import MOST_BYTES
 
 # Exceptions of the MCAP and zstd libraries and of this package for damaged bytes.
@@ -110,46 +104,38 @@ UNCLOSED = "it ends without its closing record"
 """Reason to stop at the end of a file whose writer was killed: all that was written is there."""
 
 
-class RecordingDescription(NamedTuple):
-    """The metadata of a recording. Attributes: view_shape: (R, C, K). whiskers: W. rate_hz: nominal rate, 0
-    if unknown. created_by: program and version. info: devices, world and origin of the session."""
+def metadata_of(described: SourceDescription) -> dict[str, str]:
+    """The metadata of a recording; the name of the source is the program that writes it.
 
-    view_shape: tuple[int, int, int]
-    whiskers: int
-    rate_hz: float
-    created_by: str
-    info: SourceInfo
+    Raises:
+        TypeError, ValueError: provenance is not JSON.
+    """
+    data = {
+        "format": FORMAT,
+        "view_shape": ",".join(map(str, described.view_shape)),
+        "whiskers": str(described.whiskers),
+        "rate_hz": repr(described.rate_hz),
+        "created_by": described.name,
+        "info": described.info.to_json(),
+    }
+    return data | {"crc32": metadata_checksum(data)}
 
-    def to_metadata(self) -> dict[str, str]:
-        """Raises `TypeError` or `ValueError` for provenance that is not JSON."""
-        data = {
-            "format": FORMAT,
-            "view_shape": ",".join(map(str, self.view_shape)),
-            "whiskers": str(self.whiskers),
-            "rate_hz": repr(self.rate_hz),
-            "created_by": self.created_by,
-            "info": self.info.to_json(),
-        }
-        return data | {"crc32": metadata_checksum(data)}
 
-    @classmethod
-    def from_metadata(cls, data: Mapping[str, str]) -> RecordingDescription:
-        """Raises `ValueError` for metadata that `to_metadata` cannot have written."""
-        if data.get("format") != FORMAT:
-            raise Malformed(f"its format is {data.get('format')!r}, this version reads {FORMAT!r}")
-        if data.get("crc32") != metadata_checksum(data):
-            raise Malformed("its metadata do not match their checksum")
-        try:
-            rows, columns, channels = (int(size) for size in data["view_shape"].split(","))
-            whiskers, rate_hz = int(data["whiskers"]), float(data["rate_hz"])
-            info = SourceInfo.from_json(data["info"])
-            found = cls((rows, columns, channels), whiskers, rate_hz, data["created_by"], info)
-        except KeyError as error:
-            raise Malformed(f"its metadata lack {error}") from error
-        sizes = (*found.view_shape, found.whiskers + 1)
-        if min(sizes) < 1 or rows * columns * channels + 3 * found.whiskers > MAX_NUMBERS:
-            raise Malformed(f"views of shape {found.view_shape} and {found.whiskers} whiskers")
-        return found
+def read_metadata(data: Mapping[str, str]) -> SourceDescription:
+    """The inverse of `metadata_of`; raises `ValueError` for what that cannot have written."""
+    if data.get("format") != FORMAT:
+        raise Malformed(f"its format is {data.get('format')!r}, this version reads {FORMAT!r}")
+    if data.get("crc32") != metadata_checksum(data):
+        raise Malformed("its metadata do not match their checksum")
+    try:
+        rows, columns, channels = shape = tuple(int(size) for size in data["view_shape"].split(","))
+        whiskers, rate_hz, program = int(data["whiskers"]), float(data["rate_hz"]), data["created_by"]
+        info = SourceInfo.from_json(data["info"])
+    except KeyError as error:
+        raise Malformed(f"its metadata lack {error}") from error
+    if min(*shape, whiskers + 1) < 1 or rows * columns * channels + 3 * whiskers > MAX_NUMBERS:
+        raise Malformed(f"views of shape {shape} and {whiskers} whiskers")
+    return SourceDescription((rows, columns, channels), whiskers, rate_hz, info, program)
 
 
 def is_foreign(path: Path) -> bool:
@@ -202,7 +188,7 @@ class McapScanner:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.description: RecordingDescription | None = None
+        self.description: SourceDescription | None = None
         self.broken = "it has not been read to its end"
         self.count = 0
         self._number = 0  # next message; a truth has the number of its reading
@@ -221,11 +207,11 @@ class McapScanner:
     def _entries(self, file: IO[bytes]) -> Iterator[RecordingEntry]:
         schemas: dict[int, Schema] = {}
         names: dict[int, str] = {}  # schema of each channel; '': not a ratslam topic
-        truth: bytes | None = None
+        truth: tuple[bytes, np.ndarray] | None = None
         try:
             for record in _read_records(file):
                 if isinstance(record, Metadata) and record.name == METADATA and self.description is None:
-                    self.description = RecordingDescription.from_metadata(record.metadata)
+                    self.description = read_metadata(record.metadata)
                     self._frames = FrameWindow(empty_frames(self.description.whiskers))
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
@@ -240,15 +226,17 @@ class McapScanner:
                     if record.sequence != self._number % (1 << 32):
                         raise Malformed(f"message {record.sequence} where {self._number} was expected")
                     if name == TRUTH:
-                        decode_truth(record.data)
-                        truth = record.data
+                        truth = record.data, self._decoded(name, record.data)[1]
                         continue
                     self._number += 1
-                    time, content = self._decoded(name, record.data, truth)
-                    reading = name in READINGS
-                    self.count += reading
-                    yield RecordingEntry(name, time, record.data, truth if reading else None, content)
-                    truth = None if reading else truth
+                    time, content = self._decoded(name, record.data)
+                    if name not in READINGS:
+                        yield RecordingEntry(name, time, record.data, None, content)
+                        continue
+                    self.count += 1
+                    message, pose = truth or (None, None)
+                    yield RecordingEntry(name, time, record.data, message, Sample(time, content, pose))
+                    truth = None
                 elif isinstance(record, Statistics):
                     self._check_counts(record, names)
         except _DAMAGE_ERRORS as error:
@@ -258,28 +246,15 @@ class McapScanner:
         else:
             self.broken = ""
 
-    def _decoded(
-        self, name: str, message: bytes, truth: bytes | None
-    ) -> tuple[float, Sample | Frames | np.ndarray | Event]:
-        """The time and the content of a message with this schema; truth: of a reading."""
+    def _decoded(self, name: str, message: bytes) -> tuple[float, Any]:
+        """The time and the content of a message with this schema; of a cut its cycle."""
         assert self.description is not None
-        whiskers = self.description.whiskers
-        if name in READINGS:
-            where = None if truth is None else decode_truth(truth)[1]
-            if name != CUT:
-                time, reading = decode(name, message, self.description.view_shape, whiskers)
-            else:
-                cut = decode_cut(message)
-                time, reading = cut.time, assemble_cycle(self._frames.between(cut.first, cut.last), cut)
-            return time, Sample(time, reading, where)
+        time, content = decode(name, message, self.description.view_shape, self.description.whiskers)
         if name == FRAMES:
-            time, frames = decode_frames(message, whiskers)
-            self._frames.add(frames)
-            return time, frames
-        if name == ARM:
-            return decode_states(message)
-        event = decode_event(message)
-        return event.time, event
+            self._frames.add(content)
+        if name == CUT:
+            content = assemble_cycle(self._frames.between(content.first, content.last), content)
+        return time, content
 
     def _check_counts(self, statistics: Statistics, names: Mapping[int, str]) -> None:
         """Compare counts, since a chunk with a damaged type is skipped as an unknown record."""

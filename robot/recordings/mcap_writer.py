@@ -14,9 +14,10 @@ from typing import Any, Self, cast
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from robot.recordings.cdr import READINGS, SCHEMAS, TOPICS, TRUTH, encode, encode_truth
-from robot.recordings.mcap_scanner import METADATA, RecordingDescription
-from robot.sources.source import Sample, SourceInfo
+from robot.drivers.head.decoder import Cut, Frames
+from robot.recordings.cdr import READINGS, SCHEMAS, TOPICS, TRUTH, Event, encode, encode_truth
+from robot.recordings.mcap_scanner import METADATA, metadata_of, read_metadata
+from robot.sources.source import Sample, SourceDescription, SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.files import require_new_file
 
@@ -32,8 +33,8 @@ class RecordingWriteError(InputError):
         super().__init__(str(path), f"cannot be written any further ({error.strerror or error})", "", cure)
 
 
-class McapWriter:
-    """Appends messages to a new file.
+class Recorder:
+    """Writes a new file; a context manager.
 
     Args:
         path: must not exist yet.
@@ -54,16 +55,16 @@ class McapWriter:
         self,
         path: Path,
         *,
-        view_shape: tuple[int, int, int],
-        whiskers: int,
-        rate_hz: float,
-        info: SourceInfo,
+        view_shape: tuple[int, int, int] = (3, 6, 1),
+        whiskers: int = 0,
+        rate_hz: float = 0.0,
+        info: SourceInfo | None = None,
         chunk_s: float = 0.5,
     ) -> None:
-        self.description = RecordingDescription(view_shape, whiskers, rate_hz, _program(), info)
-        metadata = self.description.to_metadata()
-        RecordingDescription.from_metadata(metadata)
-        self.path = path
+        described = SourceDescription(view_shape, whiskers, rate_hz, info or SourceInfo(), _program())
+        metadata = metadata_of(described)
+        read_metadata(metadata)
+        self.path, self._sizes = path, (view_shape, whiskers)
         try:
             self._file = WholeChunkFile(path)
         except FileExistsError:
@@ -84,8 +85,32 @@ class McapWriter:
         self._writer.add_metadata(METADATA, metadata)
         self.flush()
 
+    def write(
+        self,
+        content: Sample | Cut | Frames | np.ndarray | Event,
+        truth: np.ndarray | None = None,
+        arrival: float = np.nan,
+    ) -> None:
+        """Append a sample with its truth, or what a live session records (see `encode`).
+
+        Args:
+            truth: [3] of a cut. arrival: of frames, when the newest of them came, s.
+
+        Raises:
+            InputError: a shape, dtype or time that the recording cannot hold (nothing is written then), or
+                the disk is full.
+        """
+        if isinstance(content, Sample):
+            truth = content.truth
+            if not np.isfinite(content.time):
+                raise InputError("time", f"{content.time}", "a finite number of seconds")
+        name, time, message = encode(content, *self._sizes, arrival)
+        if truth is not None:  # written first, so that no truncated file has a reading without it
+            self.append(TRUTH, time, encode_truth(time, truth))
+        self.append(name, time, message)
+
     def append(self, name: str, time: float, message: bytes) -> None:
-        """Append a message with that schema; the truth of a reading precedes it.
+        """Append an encoded message with that schema; the truth of a reading precedes it.
 
         Raises:
             RecordingWriteError: the operating system refuses to write.
@@ -135,6 +160,14 @@ class McapWriter:
         finally:
             self._file.close()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
 
 class WholeChunkFile:
     """A new file; `flush` writes all pending bytes or none."""
@@ -177,61 +210,3 @@ def _program() -> str:
         return f"ratslam {version('ratslam')}"
     except PackageNotFoundError:  # in a checkout
         return "ratslam"
-
-
-class Recorder:
-    """Writes samples to a new file; a context manager.
-
-    Args: see `McapWriter`.
-
-    Raises:
-        InputError: the file exists or cannot be created.
-        ValueError, TypeError: provenance in `info` is not JSON.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        *,
-        view_shape: tuple[int, int, int] = (3, 6, 1),
-        whiskers: int = 0,
-        rate_hz: float = 0.0,
-        info: SourceInfo | None = None,
-        chunk_s: float = 0.5,
-    ) -> None:
-        info = info or SourceInfo()
-        self._writer = McapWriter(
-            path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, info=info, chunk_s=chunk_s
-        )
-
-    @property
-    def count(self) -> int:
-        """Number of samples so far."""
-        return self._writer.count
-
-    def write(self, sample: Sample) -> None:
-        """Append a sample.
-
-        Raises:
-            InputError: a shape, dtype or time that the recording cannot hold (nothing is written then), or
-                the disk is full.
-        """
-        if not np.isfinite(sample.time):
-            raise InputError("time", f"{sample.time}", "a finite number of seconds")
-        described = self._writer.description
-        name, message = encode(sample, described.view_shape, described.whiskers)
-        if sample.truth is not None:  # written first, so that no truncated file has a reading without it
-            self._writer.append(TRUTH, sample.time, encode_truth(sample.time, sample.truth))
-        self._writer.append(name, sample.time, message)
-
-    def close(self) -> None:
-        """Finish the file; may be called again."""
-        self._writer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
