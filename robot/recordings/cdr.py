@@ -246,8 +246,10 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
         start, seen = float(record["start"]), bool(record["seen"])
         return time, Cut(number, time, start, first, last, frames, odometry, seen)
     if name == CYCLE:
-        columns = (record[field].copy() for field in ("sample_time", "angle", "deflection"))
-        return time, Cycle(*columns, odometry)
+        sampled, angle, deflection = (
+            record[field].copy() for field in ("sample_time", "angle", "deflection")
+        )
+        return time, Cycle(sampled, angle, deflection, odometry)
     bits, names = record["flags"], FLAGS[name]
     if (bits >> len(names)).any():
         most = 2 ** len(names) - 1

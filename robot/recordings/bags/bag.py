@@ -80,6 +80,8 @@ _CONVERT = (
 )
 TRANSFORMS = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})
 """Types of /tf, of ROS 2 and 1 and of early ROS 1."""
+Clock = Literal["header", "bag"]
+OTHER_CLOCK: dict[Clock, Clock] = {"header": "bag", "bag": "header"}
 ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a compressed message; CDR begins with 00
 
 
@@ -100,20 +102,26 @@ class Bag:
             parts of a ROS 1 bag.
         warn: called with one sentence for whatever is in the bag and is not read; once for each.
         stretch: of the times of receipt; only messages within it are read, besides fixed transforms.
+        clock: which times its messages have, where they have a header.
 
     Attributes:
-        topics: by name. warn: that function.
+        topics: by name. other_clock: the setting that takes the other times of the messages.
 
     Raises:
         InputError: the bag is missing, damaged or empty, or rosbags is not installed.
     """
 
     def __init__(
-        self, path: Path, warn: Callable[[str], None] | None = None, stretch: Stretch = WHOLE
+        self,
+        path: Path,
+        warn: Callable[[str], None] | None = None,
+        stretch: Stretch = WHOLE,
+        clock: Clock = "header",
     ) -> None:
         path = path.parent if path.name == METADATA else path
         self.path, self._stack, self._told, self._warn = path, ExitStack(), set[str](), warn
-        self._stretch = stretch
+        self._stretch, self.clock = stretch, clock
+        self.other_clock = f"--set recording.topics.clock={OTHER_CLOCK[clock]}"
         files = bag_files(path)
         try:
             from rosbags import rosbag1, rosbag2
@@ -149,6 +157,7 @@ class Bag:
             raise InputError(str(path), "a bag without messages", "at least one message")
 
     def warn(self, sentence: str) -> None:
+        """Tells a sentence, once."""
         if self._warn is not None and sentence not in self._told:
             self._warn(sentence)
         self._told.add(sentence)
@@ -208,6 +217,16 @@ class Bag:
                 yield number, time, content, value
         if first is not None:
             raise_errors(leave_out(spoilt, good + spoilt, "messages", first, self.warn))
+
+    def stamp(self, content: Any, received: int, clock: Clock | None = None) -> int:
+        """The time of a message received at this time, ns, by a clock; None: that of the bag."""
+        stamped = (clock or self.clock) == "header" and hasattr(content, "header")
+        return nanoseconds(content.header.stamp) if stamped else received
+
+    def stamped(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any]]:
+        """Number, time in ns, and what `read` makes of each message that can be used (see `usable`)."""
+        for number, received, content, value in self.usable(topic, read):
+            yield number, self.stamp(content, received), value
 
     def _decoded(self, topic: Topic) -> Iterator[tuple[int, int, Any]]:
         """The messages with numbers and times of receipt; an `InputError` instead of one that cannot be
@@ -411,26 +430,6 @@ def _scanned(reader: Any, chosen: list[Any]) -> Iterator[tuple[Any, int, bytes]]
             yield connection, moment, raw
 
 
-Clock = Literal["header", "bag"]
-OTHER_CLOCK: dict[Clock, Clock] = {"header": "bag", "bag": "header"}
-
-Report = Callable[[str], None]
-
-
-def stamp_of(content: Any, received: int, clock: Clock) -> int:
-    """The time of a message received at this time, ns, by a clock."""
-    stamped = clock == "header" and hasattr(content, "header")
-    return nanoseconds(content.header.stamp) if stamped else received
-
-
-def read_usable(
-    bag: Bag, topic: Topic, clock: Clock, read: Callable[[Any, str], Any]
-) -> Iterator[tuple[int, int, Any]]:
-    """Number, time in ns, and what `read` makes of each message that can be used (see `Bag.usable`)."""
-    for number, received, content, value in bag.usable(topic, read):
-        yield number, stamp_of(content, received, clock), value
-
-
 def nanoseconds(stamp: Any) -> int:
     """A time message in ns."""
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
@@ -442,7 +441,7 @@ def in_seconds(stamps: list[int]) -> np.ndarray:
 
 
 def usable_stamps(
-    stamps: list[int], where: str, clock: Clock, report: Report, other: list[int] | None = None
+    bag: Bag, stamps: list[int], where: str, other: list[int] | None = None
 ) -> tuple[np.ndarray, list[InputError]]:
     """The messages to use: [M] bool. Those that repeat a stamp, a few with stamp 0 and a few out of order are
     left out and reported.
@@ -453,14 +452,14 @@ def usable_stamps(
     Errors: more stamps than `SPOILT` are 0 or out of order.
     """
     times = np.array(stamps, np.int64)
-    worse = clock == "bag" if other is None else bool((np.diff(other) < 0).any())
-    cure = "" if worse else other_clock(clock)
+    worse = bag.clock == "bag" if other is None else bool((np.diff(other) < 0).any())
+    cure = "" if worse else bag.other_clock
     errors, use = list[InputError](), times != 0
 
     def drop(wrong: np.ndarray, row: int, found: str, expected: str) -> None:
         """Leaves out the messages [M] bool; row: the first that is named."""
         first = InputError(f"{where}, message {row}", found, expected, cure)
-        errors.extend(leave_out(int(wrong.sum()), len(times), "messages", first, report))
+        errors.extend(leave_out(int(wrong.sum()), len(times), "messages", first, bag.warn))
         use[wrong] = False
 
     drop(~use, int((~use).argmax()), "the stamp is 0", "the time of the measurement")
@@ -476,18 +475,11 @@ def usable_stamps(
     rows = np.flatnonzero(use)
     repeated = rows[np.append(False, np.diff(times[rows]) == 0)]
     if len(repeated):
-        said = (
-            f"{len(repeated)} of {len(times)} messages repeat the stamp of the message before, the first at "
-        )
-        said += f"{times[repeated[0]] / 1e9:.3f} s; they are left out"
-        report(f"{where}: {said}{f'; {cure}' if cure and len(repeated) > len(times) / 2 else ''}")
+        said = f"{len(repeated)} of {len(times)} messages repeat the stamp of the message before, the first "
+        said += f"at {times[repeated[0]] / 1e9:.3f} s; they are left out"
+        bag.warn(f"{where}: {said}{f'; {cure}' if cure and len(repeated) > len(times) / 2 else ''}")
         use[repeated] = False
     return use, errors
-
-
-def other_clock(clock: Clock) -> str:
-    """The setting that takes the other times of the messages."""
-    return f"--set recording.topics.clock={OTHER_CLOCK[clock]}"
 
 
 def leaps(times: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -506,6 +498,8 @@ class Series(NamedTuple):
         where: file and topic, for errors. time: [M] s, increasing. values: [M, ...].
         numbers: [M] message of each value. errors: found in it; without any, M is at least 1.
         clock: the setting that takes the other times, where these leap and the others do not; else ''.
+        body: of odometry, frame of the robot, '' if the bag does not say. held: whether it was velocities.
+        poses: [M, 3] of odometry as recorded; None if there are none.
     """
 
     where: str
@@ -514,18 +508,20 @@ class Series(NamedTuple):
     numbers: np.ndarray
     errors: list[InputError]
     clock: str = ""
+    body: str = ""
+    held: bool = False
+    poses: np.ndarray | None = None
 
     def place(self, row: int) -> str:
         return f"{self.where}, message {self.numbers[row]}"
 
 
 def as_series(
+    bag: Bag,
     where: str,
     numbers: list[int],
     stamps: list[int],
     values: np.ndarray,
-    clock: Clock,
-    report: Report,
     other: list[int] | None = None,
 ) -> Series:
     """The values [M, ...] of messages with usable stamps.
@@ -535,7 +531,7 @@ def as_series(
     """
     if not stamps:
         raise InputError(where, "no message that can be used", "at least one")
-    use, errors = usable_stamps(stamps, where, clock, report, other)
+    use, errors = usable_stamps(bag, stamps, where, other)
     leap = other is not None and leaps(np.array(stamps)[use], np.array(other)[use]).any()
-    cure = other_clock(clock) if leap else ""
+    cure = bag.other_clock if leap else ""
     return Series(where, in_seconds(stamps)[use], values[use], np.array(numbers)[use], errors, cure)

@@ -173,7 +173,7 @@ def describe_bag(path: Path) -> BagDescription:
         links = []
         for name in (MOVING, STATIC):
             try:
-                found = read_links(bag, name, "header")
+                found = read_links(bag, name)
             except InputError:
                 continue  # the fault of the topic says why
             links += [(*pair, name == STATIC, len(link)) for pair, link in found.items()]
@@ -269,7 +269,7 @@ def _shape_of(bag: Bag, kind: str, kept: list[Any], stamps: list[int]) -> Shape:
         known = [median for median in medians if np.isfinite(median)]
         median = float(np.median(known)) if known else np.nan
         if len(set(frames)) > 1:  # directions in the frame of the first
-            mounts = {each: mount_of(bag, "", each, "header") or FORWARD for each in dict.fromkeys(frames)}
+            mounts = {each: mount_of(bag, "", each) or FORWARD for each in dict.fromkeys(frames)}
             turned = zip(frames, extents, strict=True)
             extents = tuple(own.turned(mounts[frame], mounts[frames[0]]) for frame, own in turned)
         wider = wider_extent(extents)

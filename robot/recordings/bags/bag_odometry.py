@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from robot.recordings.bags.bag import OTHER_CLOCK, Bag, Clock, Report, Series, as_series, stamp_of
+from robot.recordings.bags.bag import OTHER_CLOCK, Bag, Series, as_series
 from robot.recordings.bags.topics_config import OdometryTopic, PoseTopic
 from robot.recordings.bags.transforms import (
     POSES,
@@ -27,96 +27,44 @@ TURNED = 0.5
 """Typical turn between poses of different frames, rad, from which they disagree."""
 
 
-class BagOdometry(NamedTuple):
-    """The odometry of a bag, N samples.
-
-    Attributes:
-        time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous sample.
-        where: file and topic. body: frame of the robot, '' if the bag does not say. errors: found in it.
-        numbers: [N] message of each sample. held: whether these are velocities. poses: [N, 3] as recorded;
-        None if there are none. clock: the setting that takes the other clock, if that is better; else ''.
-    """
-
-    time: np.ndarray
-    motion: np.ndarray
-    where: str
-    body: str
-    errors: list[InputError]
-    numbers: np.ndarray
-    held: bool = False
-    poses: np.ndarray | None = None
-    clock: str = ""
-
-
-def read_odometry(bag: Bag, config: OdometryTopic, clock: Clock, report: Report) -> BagOdometry:
-    """The odometry.
+def read_odometry(bag: Bag, config: OdometryTopic) -> Series:
+    """The odometry: motions [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous sample.
 
     Raises:
         InputError: the topic does not exist or has no odometry.
     """
-    twist = False
-    if config.tf is not None:
-        body = config.tf[1]
-        series = poses_between(bag, config.tf, clock, report, "odometry", config.plane)
-    else:
-        assert config.topic is not None
-        kind = bag.topic(config.topic, "recording.topics.odometry").kind
-        twist = kind in TWISTS and (config.use == "twist" or kind not in POSES)
-        series, body = _read_series(bag, config, "odometry", clock, report, twist)
-    errors = series.errors + nonfinite_errors(series.values, "odometry", series.place)
-    time, values, numbers = series.time, series.values, series.numbers
+    series = read_poses(bag, config, "odometry")
+    time, values, errors = series.time, series.values, series.errors
     if len(time) < 2 and not errors:
-        errors.append(InputError(series.where, "one message with odometry", "at least two"))
+        errors = [InputError(series.where, "one message with odometry", "at least two")]
     if errors:
-        return BagOdometry(time, np.zeros((len(time), 4)), series.where, body, errors, numbers)
-    motion = from_velocities(time, *values.T) if twist else from_poses(time, values)
+        return series._replace(values=np.zeros((len(time), 4)), errors=errors)
+    motion = from_velocities(time, *values.T) if series.held else from_poses(time, values)
     if config.every > 1:
         chosen = slice(None, None, config.every)
         path = integrate(motion[:, :3])[chosen]
-        time, numbers, values = time[chosen], numbers[chosen], values[chosen]
-        motion = from_poses(time, path)
-    given = None if twist else values
-    return BagOdometry(time, motion, series.where, body, [], numbers, twist, given, series.clock)
+        series = series._replace(time=time[chosen], numbers=series.numbers[chosen])
+        motion, values = from_poses(series.time, path), values[chosen]
+    return series._replace(values=motion, poses=None if series.held else values)
 
 
-def read_poses(bag: Bag, config: PoseTopic, clock: Clock, report: Report) -> Series:
-    """True poses [M, 3] (x m, y m, heading rad).
-
-    Raises:
-        InputError: the topic does not exist or has no poses.
-    """
-    if config.tf is not None:
-        series = poses_between(bag, config.tf, clock, report, "truth", config.plane)
-    else:
-        series, _ = _read_series(bag, config, "truth", clock, report, twist=False)
-    return series._replace(errors=series.errors + nonfinite_errors(series.values, "truth", series.place))
-
-
-def motion_at(moments: np.ndarray, time: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Odometry interpolated to other times.
+def read_poses(bag: Bag, config: PoseTopic, role: str = "truth") -> Series:
+    """Poses [M, 3] (x m, y m, heading rad) of a topic or between two frames; of odometry, also velocities.
 
     Args:
-        moments: [M] s, increasing. time: [N] s of the odometry. motion: [N, 4].
+        role: `truth` or `odometry`.
 
-    Returns:
-        inside: [M] bool, moments within the odometry. motion: [I, 4] between these.
+    Raises:
+        InputError: the topic does not exist or has neither.
     """
-    inside = (time[0] <= moments) & (moments <= time[-1])
-    if not inside.any():
-        return inside, np.zeros((0, 4))
-    path = integrate(motion[:, :3])
-    path[:, 2] = np.unwrap(path[:, 2])
-    at = [np.interp(moments[inside], time, column) for column in path.T]
-    return inside, from_poses(moments[inside], np.column_stack(at))
-
-
-def _read_series(
-    bag: Bag, config: PoseTopic, role: str, clock: Clock, report: Report, twist: bool
-) -> tuple[Series, str]:
-    """Poses or velocities [M, 3] of a topic, and the frame of the robot."""
+    if config.tf is not None:
+        series = poses_between(bag, config.tf, role, config.plane)._replace(body=config.tf[1])
+        return series._replace(errors=series.errors + nonfinite_errors(series.values, role, series.place))
     assert config.topic is not None
     topic = bag.topic(config.topic, f"recording.topics.{role}")
     where = f"{bag.path}, {topic.name}"
+    wanted_twist = isinstance(config, OdometryTopic) and (config.use == "twist" or topic.kind not in POSES)
+    twist = wanted_twist and topic.kind in TWISTS
     if topic.kind not in POSES and not twist:
         known = [*POSES, *TWISTS] if role == "odometry" else [*POSES]
         raise InputError(where, f"messages of type {topic.kind}", f"one of {', '.join(dict.fromkeys(known))}")
@@ -133,9 +81,9 @@ def _read_series(
             return value
         position, turn = POSES[topic.kind](content)
         value = pose_in_plane(position, turn, place, config.plane)
-        points.append((position.x, position.y, position.z))
+        points.append(position)
         found = list[str]()  # doubtful, and can be read
-        if abs(np.hypot(np.hypot(turn.x, turn.y), np.hypot(turn.z, turn.w)) - 1) > 0.01:
+        if abs(np.hypot(np.hypot(*turn[:2]), np.hypot(*turn[2:])) - 1) > 0.01:
             found.append("orientations are not unit quaternions (only their direction is used)")
         covariance = np.asarray(getattr(getattr(content, "pose", None), "covariance", 0.0), float).ravel()
         if not np.isfinite(covariance).all() or (covariance[::7] < 0).any():
@@ -146,7 +94,7 @@ def _read_series(
 
     for number, time, content, value in bag.usable(topic, read):
         if value is not None:
-            stamps = (stamp_of(content, time, each) for each in (clock, OTHER_CLOCK[clock]))
+            stamps = (bag.stamp(content, time, each) for each in (bag.clock, OTHER_CLOCK[bag.clock]))
             rows.append((number, *stamps, frames_of(content), time))
             kept.append(value)
     if not rows:
@@ -154,14 +102,16 @@ def _read_series(
     numbers, times, others, pairs, received = ([row[k] for row in rows] for k in range(5))
     values = np.array(kept).reshape(-1, 3)
     poses = values * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict each other
-    errors = _frame_errors(where, numbers, pairs, role, poses, received, bag, report)
+    errors = _frame_errors(where, numbers, pairs, role, poses, received, bag)
     for doubt, at in doubts.items() if not errors else ():
-        report(f"{at[0]}: {len(at)} of {len(rows)} {doubt}; look at the publisher")
+        bag.warn(f"{at[0]}: {len(at)} of {len(rows)} {doubt}; look at the publisher")
     if not (twist or errors):
         errors = plane_errors(np.array(points), where, role, config.plane)
-    series = as_series(where, numbers, times, values, clock, report, others)
+    series = as_series(bag, where, numbers, times, values, others)
+    errors += series.errors
+    errors += nonfinite_errors(series.values, role, series.place)
     body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])
-    return series._replace(errors=errors + series.errors), body
+    return series._replace(errors=errors, body=body, held=twist)
 
 
 def _frame_errors(
@@ -172,7 +122,6 @@ def _frame_errors(
     poses: np.ndarray,
     received: list[int],
     bag: Bag,
-    report: Report,
 ) -> list[InputError]:
     """The error for messages of several frames whose poses [M, 3] disagree; those that agree are told.
 
@@ -193,7 +142,7 @@ def _frame_errors(
     turned = np.median(np.abs(wrap(poses[changes + 1, 2] - poses[changes, 2])))
     # Poses agree up to a path of all frames that is this many times that of each of them.
     if turned < TURNED and _length(places) <= 1.2 * (max(alone) if in_turn else sum(alone)):
-        report(f"{at}: {found}; their poses agree, look at the publisher")
+        bag.warn(f"{at}: {found}; their poses agree, look at the publisher")
         return []
     cure = f"--set recording.topics.{role}.frames=[{','.join(filter(None, usual))}]"
     if len(changes) == 1:

@@ -7,27 +7,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from itertools import compress
-from types import SimpleNamespace
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import (
-    TRANSFORMS,
-    Bag,
-    Clock,
-    Report,
-    Series,
-    in_seconds,
-    nanoseconds,
-    read_usable,
-    usable_stamps,
-)
+from robot.recordings.bags.bag import TRANSFORMS, Bag, Series, in_seconds, usable_stamps
 from robot.recordings.sanity_checks import leave_out, still_axis
 from robot.sources.input_files import missing_error, raise_errors
 from tactile.base.errors import InputError
 
 ODOMETRY = "nav_msgs/msg/Odometry"
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 
 
 def frames_of(message: Any) -> tuple[str, str]:
@@ -41,10 +33,8 @@ def yaw_of(x: float, y: float, z: float, w: float) -> float:
     return float(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
 
 
-def pose_in_plane(
-    position: Any, orientation: Any, where: str, plane: str = "xy"
-) -> tuple[float, float, float]:
-    """(x m, y m, heading rad) of a position and a quaternion.
+def pose_in_plane(position: Vector, turn: Quaternion, where: str, plane: str = "xy") -> Vector:
+    """(x m, y m, heading rad) of a position (x, y, z) and a quaternion (x, y, z, w).
 
     Args:
         plane: `xy`; `xz` of a camera (x to the right, y down, z ahead): x = z, y = -x, heading of its z axis.
@@ -52,11 +42,10 @@ def pose_in_plane(
     Raises:
         InputError: the quaternion is 0, or a number is not finite.
     """
-    turn = tuple(float(getattr(orientation, axis)) for axis in "xyzw")
     if not any(turn):
         cure = "of odometry, the velocities remain: --set recording.topics.odometry.use=twist"
         raise InputError(where, "the orientation is 0, 0, 0, 0", "a unit quaternion", cure)
-    place = tuple(float(getattr(position, axis)) for axis in plane)
+    place = tuple(position["xyz".index(axis)] for axis in plane)
     for name, values in (("orientation", turn), ("position", place)):
         if not np.isfinite(values).all():
             raise InputError(where, f"the {name} is {', '.join(map(str, values))}", "finite numbers")
@@ -66,25 +55,26 @@ def pose_in_plane(
     return place[0], place[1], yaw_of(*turn)
 
 
-POSES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
-    ODOMETRY: lambda message: (message.pose.pose.position, message.pose.pose.orientation),
-    "geometry_msgs/msg/PoseStamped": lambda message: (message.pose.position, message.pose.orientation),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: (
-        message.pose.pose.position,
-        message.pose.pose.orientation,
-    ),
-    "geometry_msgs/msg/TransformStamped": lambda message: (
-        message.transform.translation,
-        message.transform.rotation,
-    ),
+def _pose_at(*fields: str) -> Callable[[Any], tuple[Vector, Quaternion]]:
+    """Reads the position (x, y, z) and the quaternion (x, y, z, w) in these fields of a message."""
+
+    def read(message: Any) -> tuple[Vector, Quaternion]:
+        move, turn = attrgetter(*fields)(message)
+        where = float(move.x), float(move.y), float(move.z)
+        return where, (float(turn.x), float(turn.y), float(turn.z), float(turn.w))
+
+    return read
+
+
+_transform = _pose_at("transform.translation", "transform.rotation")
+POSES = {
+    ODOMETRY: _pose_at("pose.pose.position", "pose.pose.orientation"),
+    "geometry_msgs/msg/PoseStamped": _pose_at("pose.position", "pose.orientation"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_at("pose.pose.position", "pose.pose.orientation"),
+    "geometry_msgs/msg/TransformStamped": _transform,
 }
 """Message types with a pose: its position and orientation."""
-
-
-TWISTS: dict[str, Callable[[Any], Any]] = {
-    ODOMETRY: lambda message: message.twist.twist,
-    "geometry_msgs/msg/TwistStamped": lambda message: message.twist,
-}
+TWISTS = {ODOMETRY: attrgetter("twist.twist"), "geometry_msgs/msg/TwistStamped": attrgetter("twist")}
 """Message types with velocities in the frame of the robot."""
 
 
@@ -100,7 +90,7 @@ def plane_errors(points: np.ndarray, where: str, role: str, plane: str) -> list[
     return [InputError(where, found, "a path in the plane of x and y", cure)]
 
 
-def twist_in_plane(twist: Any) -> tuple[float, float, float]:
+def twist_in_plane(twist: Any) -> Vector:
     """(forward m/s, left m/s, turn rad/s) of a twist."""
     return float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
 
@@ -110,7 +100,7 @@ BODIES = ("base_link", "base_footprint")
 """Usual names of the robot's frame."""
 
 
-Link = list[tuple[int, tuple[float, ...], tuple[float, ...], int]]
+Link = list[tuple[int, Vector, Quaternion, int]]
 """The transforms from a frame to a child frame: stamp in ns, (x, y, z) in m, quaternion (x, y, z, w), number
 of the message; one is enough for a fixed link."""
 Links = dict[tuple[str, str], Link]
@@ -128,7 +118,7 @@ class Mount(NamedTuple):
 FORWARD = Mount(np.eye(3), np.zeros(3))
 
 
-def read_links(bag: Bag, name: str, clock: Clock) -> Links:
+def read_links(bag: Bag, name: str) -> Links:
     """All links on /tf or /tf_static, in any namespace; of fixed links (`/tf_static`) the last transform.
 
     Raises:
@@ -140,11 +130,10 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
             continue
         where = f"{bag.path}, {topic.name}"
         spoilt, total, first = 0, 0, None
-        for number, received, content in read_usable(bag, topic, "bag", lambda content, place: content):
+        for number, received, content, _ in bag.usable(topic, lambda content, place: None):
             for each in content.transforms:
                 frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
-                move, turn = each.transform.translation, each.transform.rotation
-                shift, quaternion = (move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)
+                shift, quaternion = _transform(each)
                 total += 1
                 if not (np.isfinite((*shift, *quaternion)).all() and any(quaternion)):
                     place = f"{where}, message {number}, {frames[0]} to {frames[1]}"
@@ -152,7 +141,7 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
                     first = first or InputError(place, found, "numbers, and a unit quaternion")
                     spoilt += 1
                     continue
-                stamp = nanoseconds(each.header.stamp) if clock == "header" else received
+                stamp = bag.stamp(each, received)
                 if name == STATIC:
                     links[frames] = []
                 links.setdefault(frames, []).append((stamp, shift, quaternion, number))
@@ -184,7 +173,7 @@ def _chain_between(links: Links, parent: str, child: str) -> _Chain | None:
     return chain[::-1]
 
 
-def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
+def mount_of(bag: Bag, body: str, sensor: str) -> Mount | None:
     """The mount of a sensor's frame on a robot's; None if the bag does not say. Links that only /tf has are
     taken as they are at first.
 
@@ -196,7 +185,7 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
         return FORWARD
     links: Links = {}
     for name in (STATIC, MOVING):
-        links = read_links(bag, name, clock) | links
+        links = read_links(bag, name) | links
         chains = (_chain_between(links, each, sensor) for each in bodies)
         if (chain := next(filter(None, chains), None)) is not None:
             whole = np.eye(4)
@@ -206,9 +195,7 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     return None
 
 
-def poses_between(
-    bag: Bag, frames: tuple[str, str], clock: Clock, report: Report, role: str, plane: str
-) -> Series:
+def poses_between(bag: Bag, frames: tuple[str, str], role: str, plane: str) -> Series:
     """Poses [M, 3] of a frame in another, at the times of the moving link with most transforms; the other
     moving links are interpolated. A single link may lie in another plane.
 
@@ -216,7 +203,7 @@ def poses_between(
         InputError: the frames do not exist, are not connected or do not move.
     """
     parent, child = (frame.lstrip("/") for frame in frames)
-    links = read_links(bag, MOVING, clock) | read_links(bag, STATIC, clock)
+    links = read_links(bag, MOVING) | read_links(bag, STATIC)
     there = sorted({frame for pair in links for frame in pair})
     for frame in (parent, child):
         if frame not in there:
@@ -231,7 +218,7 @@ def poses_between(
     times, errors = dict[tuple[str, str], np.ndarray](), list[InputError]()
     for pair in moving:
         place = f"{bag.path}, {MOVING} {' to '.join(pair)}"
-        use, faults = usable_stamps([stamp for stamp, *_ in links[pair]], place, clock, report)
+        use, faults = usable_stamps(bag, [stamp for stamp, *_ in links[pair]], place)
         links[pair] = list(compress(links[pair], use))
         times[pair] = in_seconds([stamp for stamp, *_ in links[pair]])
         errors += faults
@@ -240,14 +227,7 @@ def poses_between(
     if errors:
         return Series(where, moments, np.zeros((len(moments), 3)), numbers, errors)
     if len(chain) == 1 and chain[0][1]:
-        given = [
-            (
-                SimpleNamespace(**dict(zip("xyz", shift, strict=True))),
-                SimpleNamespace(**dict(zip("xyzw", turn, strict=True))),
-            )
-            for _, shift, turn, _ in links[lead]
-        ]
-        poses = [pose_in_plane(*pose, where, plane) for pose in given]
+        poses = [pose_in_plane(shift, turn, where, plane) for _, shift, turn, _ in links[lead]]
         errors = plane_errors(np.array([shift for _, shift, _, _ in links[lead]]), where, role, plane)
         return Series(where, moments, np.array(poses).reshape(-1, 3), numbers, errors)
     start, end = max(times[pair][0] for pair in moving), min(times[pair][-1] for pair in moving)
