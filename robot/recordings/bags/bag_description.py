@@ -69,59 +69,25 @@ class Times(NamedTuple):
         return max(self.zero, self.backwards) <= max(1, SPOILT * self.total)
 
 
-class ScanShape(NamedTuple):
-    """LaserScan.
+class Shape(NamedTuple):
+    """What the messages of a topic hold.
 
     Attributes:
-        beams: median number. extent: directions of all messages together; wider: if the first has fewer.
-        high: limit of the range, m. median: of the ranges within the limits, m, NaN if there are none.
-        nothing: share of beams without an object in range.
+        words: all of it, for a reader. size: beams of a scan (the median); width and height of an image,
+            pixels; dimensions of values.
+        low, high: of all values (positions of joints); high: of scans, limit of the range, m.
+        extent: directions of all scans together; wider: if the first has fewer.
+        pose_path, twist_path: length of poses and of velocities, m, NaN without these.
     """
 
-    beams: int
-    extent: Extent
-    wider: bool
-    high: float
-    median: float
-    nothing: float
-
-
-class CloudShape(NamedTuple):
-    """PointCloud2. Attributes: points: of the first message. reach: median distance, m."""
-
-    points: int
-    reach: float
-
-
-class ImageShape(NamedTuple):
-    """Image, CompressedImage. Attributes: width, height: of the first message, pixels. encoding: or format.
-    grey: mean, 0 to 255."""
-
-    width: int
-    height: int
-    encoding: str
-    grey: float
-
-
-class ValueShape(NamedTuple):
-    """JointState, MultiArray. Attributes: sizes: of the layout's dimensions, else the number of values. low,
-    high: of all values (positions of joints)."""
-
-    sizes: tuple[int, ...]
-    low: float
-    high: float
-
-
-class MotionShape(NamedTuple):
-    """Poses, velocities: length in m and typical speed in m/s of each, NaN without these."""
-
-    pose_path: float
-    pose_speed: float
-    twist_path: float
-    twist_speed: float
-
-
-Shape = ScanShape | CloudShape | ImageShape | ValueShape | MotionShape
+    words: str
+    size: tuple[int, ...] = ()
+    low: float = np.nan
+    high: float = np.nan
+    extent: Extent | None = None
+    wider: bool = False
+    pose_path: float = np.nan
+    twist_path: float = np.nan
 
 
 class TopicDescription(NamedTuple):
@@ -251,7 +217,8 @@ def _summary_of(content: Any, kind: str, where: str) -> Any:
     if kind in IMAGES:
         grey = grey_image(content, kind, where)
         encoding = content.encoding if kind == RAW else content.format
-        return ImageShape(grey.shape[1], grey.shape[0], encoding, float(grey.mean()))
+        height, width = grey.shape
+        return Shape(f"{width} x {height} {encoding}, mean grey {grey.mean():.0f}", (width, height))
     if kind == JOINTS:
         return (len(content.name),), np.asarray(content.position, float)
     if kind in ARRAYS:
@@ -272,27 +239,30 @@ def _shape_of(bag: Bag, kind: str, kept: list[Any], stamps: list[int]) -> Shape:
             mounts = {each: mount_of(bag, "", each) or FORWARD for each in dict.fromkeys(frames)}
             turned = zip(frames, extents, strict=True)
             extents = tuple(own.turned(mounts[frame], mounts[frames[0]]) for frame, own in turned)
-        wider = wider_extent(extents)
-        absent = float(np.mean(nothing))
-        return ScanShape(
-            int(np.median(beams)), wider or extents[0], wider is not None, highs[0], median, absent
-        )
+        wider, count = wider_extent(extents), int(np.median(beams))
+        extent = wider or extents[0]
+        turn = "all around" if extent.ring else f"over {np.degrees(abs(extent.width)):.0f} degrees"
+        words = f"{count} beams {turn}, median {median:.2g} m, {np.mean(nothing):.0%} empty"
+        return Shape(words, (count,), high=highs[0], extent=extent, wider=wider is not None)
     if kind == CLOUD:
         points = kept[0][np.isfinite(kept[0]).all(axis=1)]
         reach = float(np.median(np.hypot(points[:, 0], points[:, 1]))) if len(points) else np.nan
-        return CloudShape(len(kept[0]), reach)
+        return Shape(f"{len(kept[0])} points, median {reach:.2g} m away")
     if kind in IMAGES:
         return kept[0]
     if kind in (JOINTS, *ARRAYS):
         numbers = np.concatenate([value for _, value in kept])
         low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (np.nan, np.nan)
-        return ValueShape(kept[0][0], low, high)
-    rows, time, sizes = np.array(kept), np.array(stamps, float) / 1e9, list[float]()
+        words = f"{' x '.join(map(str, kept[0][0]))} values from {low:.3g} to {high:.3g}"
+        return Shape(words, kept[0][0], low, high)
+    rows, time, paths, speeds = np.array(kept), np.array(stamps, float) / 1e9, list[float](), list[float]()
     order = np.argsort(time, kind="stable")
     rows, time = rows[order], time[order]
     for motion in (from_poses(time, rows[:, :3]), from_velocities(time, *rows[:, 3:].T)):
         measured = np.isfinite(motion[:, 0]).any()
         track = MotionTrack(time, np.ones(len(time), bool), motion)
-        path = float(np.nansum(np.hypot(motion[:, 0], motion[:, 1])))
-        sizes += [path, typical_motion(track).speed] if measured else [np.nan, np.nan]
-    return MotionShape(*sizes)
+        paths.append(float(np.nansum(np.hypot(motion[:, 0], motion[:, 1]))) if measured else np.nan)
+        speeds.append(typical_motion(track).speed)
+    first = 0 if np.isfinite(paths[0]) else 1
+    words = f"{paths[first]:.3g} m at {speeds[first]:.2g} m/s"
+    return Shape(words, pose_path=paths[0], twist_path=paths[1])

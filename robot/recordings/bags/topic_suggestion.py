@@ -8,14 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.recordings.bags.bag_description import (
-    BagDescription,
-    MotionShape,
-    ScanShape,
-    Times,
-    TopicDescription,
-    ValueShape,
-)
+from robot.recordings.bags.bag_description import BagDescription, Times, TopicDescription
 from robot.recordings.bags.bag_reader import JOINTS
 from robot.recordings.bags.transforms import BODIES, ODOMETRY
 from robot.recordings.bags.views import CLOUD, IMAGES, SCAN
@@ -42,7 +35,7 @@ def suggested_topics(bag: BagDescription) -> dict[str, Any]:
     seen = views[0] if views else None
     if views is not None:
         found["views"] = views[1]
-    elif touch is not None and isinstance(touch.shape, ValueShape):
+    elif touch is not None and touch.shape is not None:
         seen, found["touch"] = touch, touch.name
         low, high = touch.shape.low, touch.shape.high
         if low < high and not (low >= 0 and high <= 1):
@@ -66,8 +59,8 @@ def _odometry(bag: BagDescription, truth: TopicDescription | None) -> tuple[Any,
         robots = robots_of(bag)
         return ({"tf": list(robots[0])} if robots else None), None
     shape = best.shape
-    still = isinstance(shape, MotionShape) and not shape.pose_path > LEAST_PATH
-    if best.kind == ODOMETRY and isinstance(shape, MotionShape) and still and shape.twist_path > LEAST_PATH:
+    still = shape is not None and not shape.pose_path > LEAST_PATH
+    if best.kind == ODOMETRY and shape is not None and still and shape.twist_path > LEAST_PATH:
         return {"topic": best.name, "use": "twist"}, best
     return best.name, best
 
@@ -90,10 +83,11 @@ def _views(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
         if topic is not None:
             shape = topic.shape
             options: dict[str, Any] = {}
-            if isinstance(shape, ScanShape) and shape.beams < 18:  # sectors of a view by default
-                options = {"rows": 1, "columns": shape.beams}
-            if isinstance(shape, ScanShape) and shape.wider:
-                options["span"] = [round(angle, 4) for angle in shape.extent.span]
+            if shape is not None and shape.extent is not None:  # of scans
+                if shape.size[0] < 18:  # sectors of a view by default
+                    options = {"rows": 1, "columns": shape.size[0]}
+                if shape.wider:
+                    options["span"] = [round(angle, 4) for angle in shape.extent.span]
             return topic, {"topic": topic.name, **options} if options else topic.name
     return None
 
