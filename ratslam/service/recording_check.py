@@ -126,8 +126,7 @@ def _describe_csv(path: Path) -> _FileContents:
 
 
 def _describe_bag(path: Path) -> _FileContents:
-    from robot.recordings.bags.bag_description import describe_bag
-    from robot.recordings.bags.topic_suggestion import robots_of, suggested_topics
+    from robot.recordings.bags.bag_description import describe_bag, robots_of, suggested_topics
 
     found = describe_bag(path)
     rows = [("topic", "type", "messages", "Hz", "holds", "serves as")]

@@ -12,8 +12,8 @@ import numpy as np
 
 from robot.recordings.alignment import RecordingRows, interpolated_poses, nearest_rows, no_overlap_error
 from robot.recordings.bags.bag import Bag, Series, as_series, bag_files
-from robot.recordings.bags.bag_odometry import read_odometry, read_poses
 from robot.recordings.bags.topics_config import OdometryTopic, TopicsConfig, TouchTopic, ViewsTopic
+from robot.recordings.bags.transforms import read_odometry, read_poses
 from robot.recordings.bags.views import IMAGES, KEY, read_image_views, read_range_views
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack, unit_cure
 from robot.recordings.sanity_checks import SPOILT

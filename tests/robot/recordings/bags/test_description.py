@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.recordings.bags.bag_description import Shape, describe_bag
-from robot.recordings.bags.topic_suggestion import suggested_topics
+from robot.recordings.bags.bag_description import Shape, describe_bag, suggested_topics
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from tests.helpers.ros_bags import (
