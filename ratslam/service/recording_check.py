@@ -80,7 +80,7 @@ def _describe_file(path: Path) -> _FileContents:
     Raises:
         InputError: it is missing, damaged, or of no known format.
     """
-    from robot.recordings.mcap_scanner import is_foreign
+    from robot.recordings.mcap_reader import is_foreign
     from robot.recordings.npz_trace import array_shapes
 
     if not path.exists():

@@ -18,7 +18,7 @@ from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.recordings.cdr import Event
 from robot.recordings.mcap_writer import Recorder, RecordingWriteError
-from robot.sources.source import Sample, SourceInfo
+from robot.sources.source import Sample, SourceDescription, SourceInfo
 
 BLOCK_TIME = 0.15
 """Time for which frames and states are collected into a block, s."""
@@ -50,7 +50,7 @@ class LiveRecorder:
         info: SourceInfo,
     ) -> None:
         self.fault: Fault | None = None
-        self._tape = Recorder(path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, info=info)
+        self._tape = Recorder(path, SourceDescription(view_shape, whiskers, rate_hz, info))
         self._lock = Lock()
         self._frames: list[Frames] = []
         self._states: list[np.ndarray] = []

@@ -37,7 +37,7 @@ def _open(config: RecordingConfig, judge: InputJudge) -> Source:
     """The recording as it is. Readers are imported when they are needed: some are slow to load."""
     file, suffix = config.file, config.file.suffix.lower()
     if suffix == ".mcap":
-        from robot.recordings.mcap_scanner import is_foreign
+        from robot.recordings.mcap_reader import is_foreign
     whole = config.topics is not None or (file / "metadata.yaml").is_file()
     if whole or suffix in BAGS or (suffix == ".mcap" and is_foreign(file)):
         from robot.recordings.bags.bag_reader import read_bag

@@ -1,4 +1,5 @@
-"""Writes recordings as MCAP files that stay readable when the process is killed or the disk is full.
+"""Writes recordings as MCAP files that stay readable when the process is killed or the disk is full; copies
+sources to recordings, and recovers truncated ones.
 
 Chunks are zstd-compressed, have checksums, and reach the operating system as a whole.
 """
@@ -7,6 +8,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, cast
@@ -16,10 +18,11 @@ from mcap.writer import CompressionType, Writer
 
 from robot.drivers.head.decoder import Cut, Frames
 from robot.recordings.cdr import READINGS, SCHEMAS, TOPICS, TRUTH, Event, encode, encode_truth
-from robot.recordings.mcap_scanner import METADATA, metadata_of, read_metadata
-from robot.sources.source import Sample, SourceDescription, SourceInfo
+from robot.recordings.mcap_reader import METADATA, McapScanner, metadata_of, read_metadata
+from robot.sources.input_files import require_file
+from robot.sources.source import Sample, Source, SourceDescription
 from tactile.base.errors import InputError
-from tactile.base.files import require_new_file
+from tactile.base.files import flush_to_disk, make_new_file, require_new_file
 
 _CHUNK_BYTES = 1 << 16
 """Size of a chunk before compression."""
@@ -38,8 +41,8 @@ class Recorder:
 
     Args:
         path: must not exist yet.
-        view_shape, whiskers: of every sample. rate_hz: nominal rate, 0 if unknown; for information.
-        info: devices, world and origin; stored at the start of the file, so that a truncated one has it.
+        source: has the view shape and number of whiskers of every sample, a nominal rate, and devices, world
+            and origin; stored at the start of the file, so that a truncated one has them.
         chunk_s: a chunk is written when it has `_CHUNK_BYTES`, or when the time of its last message differs
             from that of the previous chunk by this many seconds.
 
@@ -48,23 +51,13 @@ class Recorder:
 
     Raises:
         InputError: the file exists or cannot be created.
-        ValueError, TypeError: provenance in `info` is not JSON.
+        ValueError, TypeError: provenance of the source is not JSON.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        view_shape: tuple[int, int, int] = (3, 6, 1),
-        whiskers: int = 0,
-        rate_hz: float = 0.0,
-        info: SourceInfo | None = None,
-        chunk_s: float = 0.5,
-    ) -> None:
-        described = SourceDescription(view_shape, whiskers, rate_hz, info or SourceInfo(), _program())
-        metadata = metadata_of(described)
+    def __init__(self, path: Path, source: Source | SourceDescription, chunk_s: float = 0.5) -> None:
+        metadata = metadata_of(source, _program())
         read_metadata(metadata)
-        self.path, self._sizes = path, (view_shape, whiskers)
+        self.path, self._sizes = path, (source.view_shape, source.whiskers)
         try:
             self._file = WholeChunkFile(path)
         except FileExistsError:
@@ -210,3 +203,45 @@ def _program() -> str:
         return f"ratslam {version('ratslam')}"
     except PackageNotFoundError:  # in a checkout
         return "ratslam"
+
+
+def record_source(source: Source, path: Path) -> int:
+    """Write all samples of a source to a new recording; returns their number."""
+    with Recorder(path, source) as recorder:
+        for sample in source:
+            recorder.write(sample)
+        return recorder.count
+
+
+def recover(path: Path, out: Path) -> tuple[int, str]:
+    """Copy every readable message of a truncated or damaged recording, unchanged, to a new, complete one.
+
+    The new file appears under its name only when it is complete. Values are not checked.
+
+    Returns:
+        the number of samples, and the fault of the old file, '' if it was complete.
+
+    Raises:
+        InputError: `path` has no readable sample, or `out` exists.
+    """
+    require_file(path)
+    require_new_file(out)
+    scanner = McapScanner(path)
+    entries = scanner.entries()
+    first = next(entries, None)
+    if first is None or scanner.description is None:
+        raise scanner.unreadable_error()
+    described = scanner.description
+
+    def write(path: Path) -> None:
+        with Recorder(path, described) as recorder:
+            for entry in chain([first], entries):
+                if entry.truth is not None:
+                    recorder.append(TRUTH, entry.time, entry.truth)
+                recorder.append(entry.name, entry.time, entry.message)
+        if not scanner.count:
+            raise scanner.unreadable_error()
+        flush_to_disk(path)
+
+    make_new_file(out, write)
+    return scanner.count, scanner.broken

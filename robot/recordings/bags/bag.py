@@ -10,7 +10,7 @@ import bz2
 import io
 import re
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from copy import copy
 from functools import cached_property
 from heapq import heappop, heappush, merge
@@ -22,6 +22,7 @@ import numpy as np
 import zstandard
 
 from robot.recordings.input_judge import GAP, LEAST_GAP
+from robot.recordings.mcap_reader import CONVERT, container_fault
 from robot.recordings.sanity_checks import WHOLE, Stretch, leave_out
 from robot.sources.input_files import missing_error, raise_errors, require_file, unreadable_error
 from tactile.base.bounded import check_size, expand
@@ -72,12 +73,7 @@ def _bound_expansion() -> None:
 SUFFIXES = (".bag", ".db3", ".mcap")
 """Of files that can be bags."""
 METADATA = "metadata.yaml"
-MCAP = b"\x89MCAP0\r\n"  # first and last bytes of a file
 REPAIR = "was it copied and closed completely? try `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
-_CONVERT = (
-    "give the .bag or .db3 that it was made from, or convert that to ROS 2 messages (profile ros2, cdr) with "
-    "`mcap convert` or `rosbags-convert`"
-)
 TRANSFORMS = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})
 """Types of /tf, of ROS 2 and 1 and of early ROS 1."""
 Clock = Literal["header", "bag"]
@@ -300,7 +296,7 @@ class Bag:
         ]
         coded = {getattr(each.ext, "serialization_format", "cdr") for each in connections} - {"cdr"}
         if coded:
-            raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", _CONVERT)
+            raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", CONVERT)
         known = ("*", self._store.generate_msgdef(topic.kind)[1]) if self._first else ()
         if self._first and any(each.digest not in known for each in connections):
             raise InputError(where, f"another definition of {topic.kind}", "that of ROS Noetic")
@@ -330,38 +326,6 @@ def _damage_errors(path: Path) -> Iterator[None]:
 
 def _reason(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
-
-
-def container_fault(path: Path) -> tuple[str, str] | None:
-    """What is wrong with an MCAP file as a container, and the cure; None for others."""
-    from mcap.records import Channel, Chunk, Header, Message, Schema
-    from mcap.stream_reader import StreamReader
-
-    from robot.recordings.mcap_scanner import open_chunk
-
-    if path.is_dir():
-        return next(filter(None, map(container_fault, sorted(path.glob("*.mcap")))), None)
-    if path.suffix != ".mcap":
-        return None
-    profile, codes = "", set[str]()
-    with path.open("rb") as file:
-        with suppress(Exception):  # damage
-            for record in StreamReader(file, emit_chunks=True).records:
-                if isinstance(record, Header):
-                    profile = record.profile or "none"
-                for each in open_chunk(record) if isinstance(record, Chunk) else [record]:
-                    if isinstance(each, (Channel, Schema)):
-                        codes.add(each.message_encoding if isinstance(each, Channel) else each.encoding)
-                if isinstance(record, (Chunk, Message)):
-                    break
-        file.seek(-min(file.seek(0, 2), len(MCAP)), 2)
-        whole = file.read() == MCAP
-    if profile and (profile != "ros2" or codes - {"cdr", "ros2msg", "ros2idl", "omgidl", ""}):
-        found = f"an MCAP file of profile {profile} with {', '.join(sorted(codes))}, not of ROS 2"
-        return f"cannot be read as a bag: {found}", _CONVERT
-    if whole or not profile:
-        return None
-    return "cannot be read as a bag: a ROS 2 bag that is cut off", f"`mcap recover {path.name} -o whole.mcap`"
 
 
 def bag_files(path: Path) -> list[Path]:

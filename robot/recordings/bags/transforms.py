@@ -164,7 +164,7 @@ def read_links(bag: Bag, name: str) -> Links:
 
 def _chain_between(links: Links, parent: str, child: str) -> _Chain | None:
     """The links from one frame to another, each with whether it is followed downwards; None: unconnected."""
-    graph = nx.Graph()
+    graph: nx.Graph = nx.Graph()
     for pair in links:
         if not graph.has_edge(*pair):
             graph.add_edge(*pair, link=pair)

@@ -19,8 +19,7 @@ from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames, FrameWindow, ass
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
 from robot.recordings.cdr import TRUTH, Event, decode, encode
-from robot.recordings.mcap_reader import Recording
-from robot.recordings.mcap_scanner import McapScanner
+from robot.recordings.mcap_reader import McapScanner, Recording
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle
 from tests.robot.live.live_recordings import (
