@@ -102,17 +102,7 @@ string event        # its name, ': ', what was found
 (OBSERVATION, CYCLE, WHISK, REPORT, TRUTH, CUT, FRAMES, ARM, EVENT) = SCHEMAS
 READINGS = (OBSERVATION, CYCLE, WHISK, REPORT, CUT)
 """Messages that make a sample."""
-TOPICS = {
-    OBSERVATION: "/ratslam/observation",
-    CYCLE: "/ratslam/cycle",
-    WHISK: "/ratslam/whisk",
-    REPORT: "/ratslam/report",
-    TRUTH: "/ratslam/truth",
-    CUT: "/ratslam/cut",
-    FRAMES: "/ratslam/frames",
-    ARM: "/ratslam/arm",
-    EVENT: "/ratslam/event",
-}
+TOPICS = {name: f"/ratslam/{name.rsplit('/')[-1].lower()}" for name in SCHEMAS}
 SCHEMA_OF = {topic: name for name, topic in TOPICS.items()}
 
 
@@ -122,6 +112,7 @@ _FEATURES = ("touched", "highest", "reach")
 """Values of each whisker in the field `felt` of a Whisk message."""
 FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held"), REPORT: ("alive", "contact")}
 """Meaning of the bits of `flags`, from the lowest."""
+_KINDS: dict[str, Any] = {OBSERVATION: Observation, CYCLE: Cycle, WHISK: Whisk, REPORT: Report}
 _COUNTS = {CYCLE: ("samples", 44), REPORT: ("samples", 56), FRAMES: ("frames", 12), ARM: ("states", 12)}
 """The field with the number of samples, frames or states in a message, and its byte position."""
 NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")
@@ -195,7 +186,7 @@ def encode(
 def _of_reading(sample: Sample, whiskers: int) -> tuple[str, int, dict[str, Any]]:
     """The schema of a sample's reading, its number of samples, and its values by field."""
     reading, count = sample.reading, 0
-    name = {Observation: OBSERVATION, Cycle: CYCLE, Whisk: WHISK, Report: REPORT}[type(reading)]
+    name = {kind: name for name, kind in _KINDS.items()}[type(reading)]
     values: dict[str, Any] = {**reading._asdict(), **reading.odometry._asdict()}
     booleans = np.dtype(("?", (whiskers,)))
     if isinstance(reading, Cycle | Report):
@@ -245,36 +236,23 @@ def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers
         number, first, last, frames = (int(record[field]) for field in ("number", "first", "last", "frames"))
         start, seen = float(record["start"]), bool(record["seen"])
         return time, Cut(number, time, start, first, last, frames, odometry, seen)
-    if name == CYCLE:
-        sampled, angle, deflection = (
-            record[field].copy() for field in ("sample_time", "angle", "deflection")
-        )
-        return time, Cycle(sampled, angle, deflection, odometry)
-    bits, names = record["flags"], FLAGS[name]
-    if (bits >> len(names)).any():
-        most = 2 ** len(names) - 1
-        raise Malformed(f"whisker flags {int(bits.max())} where {most} is the largest possible")
-    flags = {field: (bits >> bit & 1).astype(bool) for bit, field in enumerate(names)}
-    if name == WHISK:
-        felt = {field: record["felt"][:, k].copy() for k, field in enumerate(_FEATURES)}
-        return time, Whisk(odometry=odometry, **flags, **felt)
+    kind = _KINDS[name]
+    fields = [field for field in kind._fields if field in (dtype.names or ())]
+    values = {field: record[field].copy() for field in fields}  # copies are aligned and writable
+    for bit, field in enumerate(FLAGS.get(name, ())):
+        values[field] = (record["flags"] >> bit & 1).astype(bool)
+    if name in FLAGS and (record["flags"] >> len(FLAGS[name])).any():
+        most = 2 ** len(FLAGS[name]) - 1
+        raise Malformed(f"whisker flags {int(record['flags'].max())} where {most} is the largest possible")
+    if name == OBSERVATION:
+        values["alive"] = ~values.pop("dead")
+    elif name == WHISK:
+        values |= {field: record["felt"][:, k].copy() for k, field in enumerate(_FEATURES)}
+    else:
+        values["time"] = record["sample_time"].copy()
     if name == REPORT:
-        sampled, strain = record["sample_time"].copy(), record["strain"].copy()
-        moved, ended = int(record["motion"]), int(record["moment"])
-        return time, Report(odometry, moved, ended, **flags, time=sampled, strain=strain)
-    return time, Observation(
-        odometry=odometry,
-        motion=record["motion"],
-        view=record["view"].copy(),  # copies are aligned and writable
-        view_seen=record["view_seen"],
-        label=record["label"],
-        contact=flags["contact"],
-        alive=~flags["dead"],
-        point=record["point"].copy(),
-        wall=record["wall"],
-        wall_point=record["wall_point"].copy(),
-        wall_sd=record["wall_sd"],
-    )
+        values |= {field: int(record[field]) for field in ("motion", "moment")}
+    return time, kind(odometry=odometry, **values)
 
 
 def _frames(record: Any) -> Frames:

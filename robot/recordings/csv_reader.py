@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from robot.recordings import csv_config as columns
 from robot.recordings.alignment import (
-    RecordingRows,
+    blank_rows,
     interpolated_poses,
+    judged,
     nearest_rows,
     range_errors,
     range_pixels,
@@ -33,7 +34,7 @@ from robot.recordings.sanity_checks import (
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors
 from robot.sources.odometry import from_motions, from_poses, from_velocities
-from robot.sources.source import PlanarWhiskersInfo, Warn
+from robot.sources.source import PlanarWhiskersInfo, SourceInfo, Warn
 from tactile.base.errors import InputError
 from tactile.base.settings import Settings
 
@@ -96,11 +97,9 @@ def read_csv_recording(
         start = base.column(config.time, "time", config.units.time)[0] if there else 0.0
         time = np.nan_to_num(start) + kept / config.rate
     motion, poses, faults = _motion(base, time, kept, config, limits)
-    recording = RecordingRows(
-        str(path), time, motion, (config.rows, config.columns, 1), 0, errors + faults, poses=poses
-    )
-    recording.place, recording.held = base.place, isinstance(part, columns.VelocityColumns)
-    recording.cures = lambda quantity, unit: f"--set recording.table.units.{quantity}={unit}"
+    shape, held = (config.rows, config.columns, 1), isinstance(part, columns.VelocityColumns)
+    errors += faults
+    source = blank_rows(path, time, motion, shape)
     # What belongs to a row that is left out, is left out too.
     every, rows = time, np.arange(len(whole.lines))
     if len(kept) < len(rows):  # the times of rows that are left out lie between those of their neighbours
@@ -114,30 +113,33 @@ def read_csv_recording(
     def placed(file: Path | None, aligned: AlignedRows) -> tuple[np.ndarray, np.ndarray]:
         """The values without errors whose row is kept, and its number."""
         rows, values, faults = aligned
-        recording.errors += faults
+        errors.extend(faults)
         if faults:
             return np.zeros(0, int), values[:0]
         rows = rows if files.of(file) is base else row_of[rows]
         return rows[rows >= 0], values[rows >= 0]
 
     if config.views is not None:
-        rows, values = placed(config.views.file, _views(files, config.views, recording.shape))
-        recording.views[rows], recording.seen[rows] = values.reshape(-1, *recording.shape), True
-    if (touch := config.contacts) is not None:
-        rows, values = placed(touch.file, _contacts(files, touch))
-        mounts = tuple((0.0, 0.0, direction) for direction in touch.directions.values())
-        recording.set_contacts(rows, values, PlanarWhiskersInfo(mounts=mounts, length=touch.distance))
+        rows, values = placed(config.views.file, _views(files, config.views, shape))
+        source["views"][rows], source["seen"][rows] = values.reshape(-1, *shape), True
+    if config.contacts is not None:
+        rows, values = placed(config.contacts.file, _contacts(files, config.contacts))
+        source |= _touch(config.contacts, rows, values, len(time))
     if config.pairs is not None:
-        rows, recording.label[rows] = placed(config.pairs.file, _pairs(files, config.pairs))
+        rows, source["label"][rows] = placed(config.pairs.file, _pairs(files, config.pairs))
     elif config.labels is not None:
-        rows, recording.label[rows] = placed(config.labels.file, _labels(files, config.labels))
+        rows, source["label"][rows] = placed(config.labels.file, _labels(files, config.labels))
     if config.truth is not None:
         file = files.of(config.truth.file)
         same, clock = file is base, time if file is base else files.time
         truth, faults = align_truth(file, config.truth, clock, limits, same, warn)
-        recording.truth = truth if same else truth[kept]
-        recording.errors += faults
-    return recording.source(path.stem, digest, judge)
+        source["truth"] = truth if same else truth[kept]
+        errors.extend(faults)
+    ids_alone = bool((source["label"] >= 0).any()) and not source["seen"].any()
+    info = SourceInfo(labels_only=ids_alone, planar_whiskers=source.pop("sensors", None))
+    cures = "--set recording.table.units.{}={}".format
+    found_all = InMemorySource(digest=digest, info=info, **source)
+    return judged(found_all, errors, judge, str(path), base.place, held, poses, cures)
 
 
 def _within(
@@ -310,6 +312,21 @@ def _contacts(files: _Files, part: columns.ContactColumns) -> AlignedRows:
         errors.append(InputError(file.place(there[row]), found, "1 in contact, 0 without"))
     rows, faults = _match_rows(files, file, there, part)
     return rows, values == 1, errors + faults
+
+
+def _touch(
+    part: columns.ContactColumns, rows: np.ndarray, touching: np.ndarray, count: int
+) -> dict[str, Any]:
+    """Contacts [M, W] at M of so many rows, and none at the others, as arguments of `InMemorySource`; the
+    sensors that make them."""
+    contact = np.zeros((count, len(part.directions)), bool)
+    contact[rows] = touching
+    angle = np.radians(list(part.directions.values()))
+    tips = part.distance * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    mounts = tuple((0.0, 0.0, direction) for direction in part.directions.values())
+    sensors = PlanarWhiskersInfo(mounts=mounts, length=part.distance)
+    point, alive = tips * contact[:, :, None], np.ones(len(angle), bool)
+    return {"contact": contact, "point": point, "alive": alive, "sensors": sensors}
 
 
 def _labels(files: _Files, labels: columns.LabelColumns) -> AlignedRows:

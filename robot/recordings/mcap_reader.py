@@ -38,7 +38,7 @@ from robot.recordings.cdr import (
 )
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.sanity_checks import clock_errors, first_error, nonfinite_errors, view_errors
-from robot.sources.input_files import digest_of_files, raise_errors, require_file, unreadable_error
+from robot.sources.input_files import digest_of, raise_errors, require_file, unreadable_error
 from robot.sources.source import ClosedSource, Sample, Source, SourceDescription, SourceInfo, rate_of
 from tactile.base.bounded import MOST_BYTES
 from tactile.base.errors import InputError
@@ -355,7 +355,7 @@ class Recording(ClosedSource):
         require_file(path)
         self.path = path
         self.name = path.stem
-        self.digest = digest_of_files([path])
+        self.digest = digest_of([path])
         scanner = McapScanner(path)
         columns = array("d")
         events: list[Event] = []

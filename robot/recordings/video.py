@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
@@ -179,15 +179,8 @@ def _vertex(errors: np.ndarray, best: int) -> float:
     return (left - right) / (2 * rise) if rise > 0 else 0.0
 
 
-class Frame(NamedTuple):
-    """One image.
-
-    Attributes:
-        time: s, on the clock of the recording. grey: [H, W] uint8.
-    """
-
-    time: float
-    grey: np.ndarray
+Frame = tuple[float, np.ndarray]
+"""The time of an image, s, on the clock of the recording, and the image in grey, [H, W] uint8."""
 
 
 def camera_rows(
@@ -210,23 +203,25 @@ def camera_rows(
     time, pictures, moves = list[float](), list[np.ndarray](), list[tuple[float, float]]()
     size: tuple[int, ...] | None = None
     before: tuple[Profile, Profile] | None = None
-    for number, frame in enumerate(frames):
+    for number, (moment, grey) in enumerate(frames):
         place = f"{where}, frame {number}"
-        size = size or frame.grey.shape
-        if frame.grey.shape != size:
-            found = f"{frame.grey.shape[1]} x {frame.grey.shape[0]} pixels"
+        size = size or grey.shape
+        if grey.shape != size:
+            found = f"{grey.shape[1]} x {grey.shape[0]} pixels"
             raise InputError(place, found, f"{size[1]} x {size[0]}, as in frame 0")
-        pictures.append(image_view(views, frame.grey, place))
+        pictures.append(image_view(views, grey, place))
         if odometry is not None:
-            turning = _profile(odometry, "rotation", frame.grey, place)
-            after = turning, _profile(odometry, "translation", frame.grey, place)
+            after = (
+                _profile(odometry, "rotation", grey, place),
+                _profile(odometry, "translation", grey, place),
+            )
             pixel_angle = float(np.deg2rad(odometry.fov_deg)) / size[1]
             step = 0.0, 0.0
             if before is not None:
-                step = _motion_between(odometry, before, after, pixel_angle, frame.time - time[-1])
+                step = _motion_between(odometry, before, after, pixel_angle, moment - time[-1])
             moves.append(step)
             before = after
-        time.append(frame.time)
+        time.append(moment)
     if not time:
         raise InputError(where, "no frames", "at least one image")
     clock = np.array(time)
@@ -299,7 +294,7 @@ def video_frames(
                 if not good:
                     cure = "was the file copied completely?"
                     raise InputError(f"{path}, frame {count}", "cannot be decoded", "an image", cure)
-                yield Frame(time, np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)))
+                yield time, np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
             count += 1
     if warn is not None and count < announced:
         warn(f"{path}: only {count} of {announced} frames can be read")

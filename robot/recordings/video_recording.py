@@ -12,7 +12,7 @@ from robot.recordings.input_judge import InputJudge, MotionTrack
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.video import VideoConfig, camera_rows, stamp_errors, video_frames
 from robot.sources.in_memory import InMemorySource
-from robot.sources.input_files import digest_of, digest_of_files, raise_errors, require_file
+from robot.sources.input_files import digest_of, raise_errors, require_file
 from tactile.base.errors import InputError
 
 
@@ -36,7 +36,7 @@ def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
     time, view, motion = camera_rows(
         video_frames(path, video, stamps, judge.warn), config.image, visual, str(path)
     )
-    digest = digest_of_files([path], b"" if stamps is None else stamps.content)
+    digest = digest_of([path, b"" if stamps is None else stamps.content])
     inside = judge.stretch.rows(time, str(path))
     time, view = time[inside], view[inside]
     if wheels is not None:

@@ -57,28 +57,22 @@ def read_bytes(path: Path) -> bytes:
         raise unreadable_error(path, error) from error
 
 
-def digest_of(contents: Iterable[bytes]) -> str:
-    """SHA-256 (hex) of the concatenated contents."""
-    total = hashlib.sha256()
-    for content in contents:
-        total.update(content)
-    return total.hexdigest()
-
-
-def digest_of_files(paths: Iterable[Path], more: bytes = b"") -> str:
-    """SHA-256 (hex) of the contents of files, which may be larger than the memory, and of more.
+def digest_of(contents: Iterable[bytes | Path]) -> str:
+    """SHA-256 (hex) of the contents one after another, also those of files, which may exceed the memory.
 
     Raises:
-        InputError: one cannot be read.
+        InputError: a file cannot be read.
     """
     total = hashlib.sha256()
-    for path in paths:
+    for content in contents:
+        if isinstance(content, bytes):
+            total.update(content)
+            continue
         try:
-            with path.open("rb") as file:
+            with content.open("rb") as file:
                 hashlib.file_digest(file, lambda: total)
         except OSError as error:
-            raise unreadable_error(path, error) from error
-    total.update(more)
+            raise unreadable_error(content, error) from error
     return total.hexdigest()
 
 

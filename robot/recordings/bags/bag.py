@@ -15,7 +15,7 @@ from copy import copy
 from functools import cached_property
 from heapq import heappop, heappush, merge
 from pathlib import Path
-from types import SimpleNamespace, TracebackType
+from types import SimpleNamespace
 from typing import IO, Any, Literal, NamedTuple, Self, cast
 
 import numpy as np
@@ -304,9 +304,7 @@ class Bag:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._stack.close()
 
 

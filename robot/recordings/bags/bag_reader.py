@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.recordings.alignment import RecordingRows, interpolated_poses, nearest_rows, no_overlap_error
+from robot.recordings.alignment import blank_rows, interpolated_poses, judged, nearest_rows, no_overlap_error
 from robot.recordings.bags.bag import Bag, Series, as_series, bag_files
 from robot.recordings.bags.topics_config import OdometryTopic, TopicsConfig, TouchTopic, ViewsTopic
 from robot.recordings.bags.transforms import read_odometry, read_poses
@@ -19,7 +19,7 @@ from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack,
 from robot.recordings.sanity_checks import SPOILT
 from robot.recordings.video import ImageViewConfig, VisualOdometryConfig
 from robot.sources.in_memory import InMemorySource
-from robot.sources.input_files import digest_of_files, missing_error, raise_errors
+from robot.sources.input_files import digest_of, missing_error, raise_errors
 from robot.sources.odometry import from_poses
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
@@ -147,19 +147,21 @@ def read_bag(
         odometry, views = _sample_views(bag, odometry, views)
     shape, whiskers = NO_VIEWS, 0
     if views is not None:
-        rows, columns = views.values.shape[1:3]
-        shape, whiskers = (rows, columns, 1), rows * columns if config.touch is not None else 0
-    recording = RecordingRows(str(path), odometry.time, odometry.values, shape, whiskers)
+        shape = (*views.values.shape[1:3], 1)
+        whiskers = shape[0] * shape[1] if config.touch is not None else 0
+    errors = list[InputError]()
+    rows = blank_rows(path, odometry.time, odometry.values, shape)
     if views is not None:
         part = config.views or config.touch
-        _place_views(bag, recording, views, part.tolerance if part else None)
+        errors += _place_views(bag, rows, views, part.tolerance if part else None)
     if truth is not None:
-        recording.truth, faults = interpolated_poses(
+        rows["truth"], faults = interpolated_poses(
             odometry.time, truth.time, truth.values, "time", truth.where
         )
-        recording.errors += faults
-    judge = replace(judge, warn=None)  # the odometry is judged: only the truth is compared
-    return recording.source(path.stem, digest_of_files(bag_files(path)), judge)
+        errors += faults
+    source = InMemorySource(digest=digest_of(bag_files(path)), alive=np.ones(whiskers, bool), **rows)
+    # The odometry is judged: only the truth is compared.
+    return judged(source, errors, replace(judge, warn=None), str(path))
 
 
 def _judge(odometry: Series, judge: InputJudge) -> list[InputError]:
@@ -231,15 +233,16 @@ def _sample_views(bag: Bag, odometry: Series, views: Series) -> tuple[Series, Se
     return odometry._replace(time=views.time, values=from_poses(views.time, poses[inside])), views
 
 
-def _place_views(bag: Bag, recording: RecordingRows, views: Series, tolerance: float | None) -> None:
-    """Gives each view to the nearest sample; of several for one sample the nearest is used."""
-    found = nearest_rows(views.time, recording.time, tolerance)
+def _place_views(
+    bag: Bag, source: dict[str, Any], views: Series, tolerance: float | None
+) -> list[InputError]:
+    """Gives each view to the nearest row of a source; of several for one row the nearest is used."""
+    found = nearest_rows(views.time, source["time"], tolerance)
     assert found is not None  # the clock is checked
     rows, away, reach = found
     near = away <= reach
     if not near.any():
-        recording.errors.append(no_overlap_error(views.time, recording.time, "time", views.where))
-        return
+        return [no_overlap_error(views.time, source["time"], "time", views.where)]
     _report_unused(bag, views, ~near, f"over {reach:.3g} s away from every sample")
     order = np.lexsort([away, rows])
     order = order[near[order]]
@@ -249,7 +252,8 @@ def _place_views(bag: Bag, recording: RecordingRows, views: Series, tolerance: f
     beaten[use] = False
     why = "farther from their sample than another (or set recording.topics.samples: views)"
     _report_unused(bag, views, beaten, why)
-    recording.views[rows[use]], recording.seen[rows[use]] = views.values[use], True
+    source["views"][rows[use]], source["seen"][rows[use]] = views.values[use], True
+    return []
 
 
 def _report_unused(bag: Bag, views: Series, unused: np.ndarray, why: str) -> None:

@@ -386,7 +386,7 @@ def read_image_views(
         for number, stamp, grey in bag.stamped(topic, image_of):
             numbers.append(number)
             stamps.append(stamp)
-            yield Frame(stamp / 10**9, grey)
+            yield stamp / 10**9, grey
 
     _, view, motion = camera_rows(frames(), image, visual_odometry, where)
     views = as_series(bag, where, numbers, stamps, view)
