@@ -77,7 +77,7 @@ def read_csv_recording(
     paths = [path, *(part.file for part in parts if part is not None and part.file is not None)]
     found = {name: read_csv(name, config.units.time) for name in dict.fromkeys(paths)}
     raise_errors(_absences(found[path], found, config))
-    digest, limits, warn = digest_of(file.content for file in found.values()), judge.limits, judge.warn
+    digest, warn = digest_of(file.content for file in found.values()), judge.warn
     if judge.stretch != WHOLE:
         found = _within(found, path, config, judge.stretch)
 
@@ -96,7 +96,7 @@ def read_csv_recording(
         there = config.time in (*base.names, *base.full)
         start = base.column(config.time, "time", config.units.time)[0] if there else 0.0
         time = np.nan_to_num(start) + kept / config.rate
-    motion, poses, faults = _motion(base, time, kept, config, limits)
+    motion, poses, faults = _motion(base, time, kept, config, judge.limits)
     shape, held = (config.rows, config.columns, 1), isinstance(part, columns.VelocityColumns)
     errors += faults
     source = blank_rows(path, time, motion, shape)
@@ -132,7 +132,7 @@ def read_csv_recording(
     if config.truth is not None:
         file = files.of(config.truth.file)
         same, clock = file is base, time if file is base else files.time
-        truth, faults = align_truth(file, config.truth, clock, limits, same, warn)
+        truth, faults = align_truth(file, config.truth, clock, judge, same)
         source["truth"] = truth if same else truth[kept]
         errors.extend(faults)
     ids_alone = bool((source["label"] >= 0).any()) and not source["seen"].any()
@@ -391,12 +391,7 @@ def labels_from_pairs(
 
 
 def align_truth(
-    file: CsvFile,
-    part: columns.TruthColumns,
-    time: np.ndarray,
-    limits: UnitLimits,
-    same_rows: bool,
-    warn: Warn = None,
+    file: CsvFile, part: columns.TruthColumns, time: np.ndarray, judge: InputJudge, same_rows: bool
 ) -> tuple[np.ndarray, list[InputError]]:
     """True poses [N, 3] at times [N] s, NaN outside the time span of the truth.
 
@@ -405,13 +400,13 @@ def align_truth(
     """
     names = [name for name, _ in column_keys(part, "")[same_rows:]]
     clock = "" if same_rows else part.time
-    good, errors = _sound_rows(file, names, "true poses", warn, clock, part.quaternion or ())
+    good, errors = _sound_rows(file, names, "true poses", judge.warn, clock, part.quaternion or ())
     unknown = np.full((len(time), 3), np.nan)
     if errors:
         return unknown, errors
     file = file.rows(good)
     moments = time[good] if same_rows else file.column(part.time, "time", part.units.time)
-    truth, errors = _read_poses(file, part, part.units, moments, limits, "table.truth")
+    truth, errors = _read_poses(file, part, part.units, moments, judge.limits, "table.truth")
     if same_rows:
         unknown[good] = truth
         return unknown, errors

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from robot.recordings.bags.topics_config import TopicsConfig
 from robot.recordings.input_judge import InputJudge
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import Stretch
@@ -42,8 +41,7 @@ def _open(config: RecordingConfig, judge: InputJudge) -> Source:
     if whole or suffix in BAGS or (suffix == ".mcap" and is_foreign(file)):
         from robot.recordings.bags.bag_reader import read_bag
 
-        topics, motion = config.topics or TopicsConfig(), config.visual_odometry
-        return read_bag(file, topics, judge, image=config.image, visual_odometry=motion)
+        return read_bag(config, judge)
     if suffix == ".mcap":
         from robot.recordings.mcap_reader import Recording
 

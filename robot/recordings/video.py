@@ -23,7 +23,6 @@ import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from robot.recordings.csv_file import CsvFile
-from robot.recordings.sanity_checks import clock_errors
 from robot.sources.input_files import require_file
 from robot.sources.odometry import from_motions
 from robot.sources.source import Warn
@@ -265,19 +264,13 @@ def describe_video(path: Path) -> tuple[int, float, int, int]:
     return int(frames), rate, int(width), int(height)
 
 
-def stamp_errors(file: CsvFile, column: str) -> list[InputError]:
-    """Errors of a file of stamps: no such column, numbers that are not finite, times that do not increase."""
-    errors = file.absences([(column, "video.time")])
-    return errors or file.judge([column])[1] + clock_errors(file.column(column, "time"), column, file.place)
-
-
 def video_frames(
     path: Path, config: VideoConfig, stamps: CsvFile | None, warn: Warn = None
 ) -> Iterator[Frame]:
     """The frames of a video, decoded one by one. Colours become grey as in JPEG, 0.299 R + 0.587 G + 0.114 B.
 
     Args:
-        stamps: the file `config.stamps`, checked by `stamp_errors`; None: times follow from `config.rate`.
+        stamps: the file `config.stamps`, whose times increase; None: times follow from `config.rate`.
         warn: called with one sentence if the file ends before the frames that it announces.
 
     Raises:

@@ -5,7 +5,6 @@ topic.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,9 @@ from robot.recordings.bags.bag import Bag, Series, as_series, bag_files
 from robot.recordings.bags.topics_config import OdometryTopic, TopicsConfig, TouchTopic, ViewsTopic
 from robot.recordings.bags.transforms import read_odometry, read_poses
 from robot.recordings.bags.views import IMAGES, KEY, read_image_views, read_range_views
-from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack, unit_cure
+from robot.recordings.input_judge import InputJudge, MotionTrack, unit_cure
+from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import SPOILT
-from robot.recordings.video import ImageViewConfig, VisualOdometryConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors
 from robot.sources.odometry import from_poses
@@ -113,32 +112,25 @@ NO_VIEWS = (3, 6, 1)  # shape of the masked views of a recording without any
 
 
 @np.errstate(all="ignore")  # what is no number, or far too large, is reported
-def read_bag(
-    path: Path,
-    config: TopicsConfig,
-    judge: InputJudge = DEFAULT_JUDGE,
-    *,
-    image: ImageViewConfig | None = None,
-    visual_odometry: VisualOdometryConfig | None = None,
-) -> InMemorySource:
+def read_bag(settings: RecordingConfig, judge: InputJudge) -> InMemorySource:
     """A bag as a `Source`: one sample for each odometry message, or for each view.
 
     Args:
         judge: is told of every message that is left out, and judges the odometry.
-        image: how images become views. visual_odometry: for a bag of images without odometry.
 
     Raises:
         InputError: the bag is damaged, topics are missing or of another type, or values are impossible.
     """
+    path, config = settings.file, settings.topics or TopicsConfig()
     with Bag(path, judge.say, judge.stretch, config.clock) as bag:
         config = _with_preset(bag, config)
         if config.views is not None and config.touch is not None:
             raise InputError("recording.topics", "both views and touch", "one of them")
-        if config.odometry is None and (visual_odometry is None or config.views is None):
+        if config.odometry is None and (settings.visual_odometry is None or config.views is None):
             expected = "topics: {odometry: TOPIC}, or images as views and visual_odometry"
             listed = ", ".join(f"{topic.name} ({topic.kind})" for topic in bag.topics.values())
             raise InputError("recording.topics", "no odometry", expected, f"the bag has {listed}")
-        odometry, views = _read_steps(bag, config, image or ImageViewConfig(), visual_odometry)
+        odometry, views = _read_steps(bag, config, settings)
         truth = None if config.truth is None else read_poses(bag, config.truth)
     found = [*odometry.errors, *(views.errors if views else []), *(truth.errors if truth else [])]
     raise_errors(list(dict.fromkeys(found)))
@@ -198,17 +190,12 @@ def _with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
     return config.model_copy(update=found)
 
 
-def _read_steps(
-    bag: Bag,
-    config: TopicsConfig,
-    image: ImageViewConfig,
-    visual_odometry: VisualOdometryConfig | None,
-) -> tuple[Series, Series | None]:
+def _read_steps(bag: Bag, config: TopicsConfig, settings: RecordingConfig) -> tuple[Series, Series | None]:
     """The odometry, and the views or touch readings if there are any."""
     odometry = None if config.odometry is None else read_odometry(bag, config.odometry)
     if config.views is not None and (topic := bag.topic(config.views.topic, KEY)).kind in IMAGES:
-        wanted = None if odometry is not None else visual_odometry
-        views, motion = read_image_views(bag, topic, image, wanted)
+        wanted = None if odometry is not None else settings.visual_odometry
+        views, motion = read_image_views(bag, topic, settings.image, wanted)
         if odometry is not None:
             return odometry, views
         assert motion is not None
