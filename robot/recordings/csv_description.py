@@ -92,14 +92,12 @@ def describe_csv(path: Path) -> CsvDescription:
         views, ranges = _views(file, other)
         if views is not None and "views" not in table:
             table |= views
-            parts["views"] = _words({"views": views["views"]})
             max_range = ranges
-        for name, part in _truth_and_labels(file, other).items():
-            if name not in table:
-                table[name] = part
-                parts[name] = _words({name: part})
+        table |= {name: part for name, part in _truth_and_labels(file, other).items() if name not in table}
     if "pairs" in table and "labels" in table:
-        del table["pairs"], parts["pairs"]
+        del table["pairs"]
+    beside = ("views", "truth", "labels", "pairs")
+    parts |= {name: _words({name: part}) for name, part in table.items() if name in beside}
     if not {"views", "labels", "pairs"} & table.keys():
         missing.append("views: numbered columns (r0, r1, ...), here or in a file whose name begins alike")
     if "truth" not in table:
@@ -208,14 +206,12 @@ def _odometry(file: CsvFile) -> dict[str, Any] | None:
         poses.pop("", None)
     if poses:
         return {"pose": next(iter(poses.values()))}
-    forward, turn = _named(file, _FORWARD_SPEEDS), _named(file, _TURN_RATES)
-    if forward is not None and turn is not None:
-        left = _named(file, _LEFT_SPEEDS)
-        return {"velocity": {"forward": forward, "turn": turn} | ({"left": left} if left else {})}
-    forward, turn = _named(file, DISTANCES), _named(file, TURNS)
-    return (
-        {"motion": {"forward": forward, "turn": turn}} if forward is not None and turn is not None else None
-    )
+    steps = {"velocity": (_FORWARD_SPEEDS, _TURN_RATES, _LEFT_SPEEDS), "motion": (DISTANCES, TURNS, ())}
+    for kind, names in steps.items():
+        forward, turn, left = (_named(file, each) for each in names)
+        if forward is not None and turn is not None:
+            return {kind: {"forward": forward, "turn": turn} | ({"left": left} if left else {})}
+    return None
 
 
 def _truth_and_labels(file: CsvFile, other: CsvFile) -> dict[str, dict[str, Any]]:
@@ -275,10 +271,12 @@ def _columns(file: CsvFile) -> tuple[tuple[str, float, float], ...]:
                 found[joined] = file.block(prefix)[0]
         else:
             found[name] = file.values[:, place]
-    known = {name: values[np.isfinite(values)] for name, values in found.items()}
-    nothing = np.array([np.nan])
-    known = {name: values if len(values) else nothing for name, values in known.items()}
-    return tuple((name, float(values.min()), float(values.max())) for name, values in known.items())
+    columns = []
+    for name, values in found.items():
+        known = values[np.isfinite(values)]
+        low, high = (known.min(), known.max()) if len(known) else (np.nan, np.nan)
+        columns.append((name, float(low), float(high)))
+    return tuple(columns)
 
 
 def _words(settings: dict[str, Any]) -> str:

@@ -343,7 +343,11 @@ def _labels(files: _Files, labels: columns.LabelColumns) -> AlignedRows:
 
 
 def _pairs(files: _Files, part: columns.PairColumns) -> AlignedRows:
-    """Place labels [V] int32 derived from pairs."""
+    """Place labels [V] int32 from pairs of times that a place recogniser matched, in order of appearance.
+
+    Every time is a view; its best earlier match passes on its label, without one the view is a new place. Of
+    matches with equal scores the first is used.
+    """
     file = files.of(part.file)
     later, earlier = (file.column(name, "time") for name in (part.later, part.earlier))
     score = file.column(part.score)
@@ -354,40 +358,19 @@ def _pairs(files: _Files, part: columns.PairColumns) -> AlignedRows:
     errors += first_error(crossed, file.place, found, "the later time of a pair first", cure)
     if errors:
         return later, later, errors
-    moments, ids = labels_from_pairs(later.tolist(), earlier.tolist(), score.tolist(), part.threshold)
-    rows, errors = each_nearest(
-        moments, files.time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}"
-    )
-    return rows, ids, errors
-
-
-def labels_from_pairs(
-    later: Sequence[float], earlier: Sequence[float], score: Sequence[float], threshold: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Place labels from pairs of times that a place recogniser matched.
-
-    Every time is a view; its best earlier match passes on its label, without one the view is a new place.
-
-    Args:
-        later, earlier: s, the two times of each pair. score: similarity of each pair.
-        threshold: smallest score of a match. Of equal scores the first pair is used.
-
-    Returns:
-        time: [V] s, increasing. label: [V] int32, places numbered in order of appearance.
-    """
     best: dict[float, tuple[float, float]] = {}
-    for time, match, value in zip(later, earlier, score, strict=True):
-        if value >= threshold and (time not in best or value > best[time][0]):
+    for time, match, value in zip(later.tolist(), earlier.tolist(), score.tolist(), strict=True):
+        if value >= part.threshold and (time not in best or value > best[time][0]):
             best[time] = value, match
-    moments = np.unique(np.concatenate([later, earlier]))
-    ids: dict[float, int] = {}
-    places = 0
+    moments, ids, places = np.unique(np.concatenate([later, earlier])), dict[float, int](), 0
     for moment in moments.tolist():
         if moment in best:
             ids[moment] = ids[best[moment][1]]
         else:
             ids[moment], places = places, places + 1
-    return moments, np.fromiter(ids.values(), np.int32, len(ids))
+    place = lambda row: f"{file.path}, time {moments[row]}"  # noqa: E731
+    rows, errors = each_nearest(moments, files.time, part.tolerance, place)
+    return rows, np.fromiter(ids.values(), np.int32, len(ids)), errors
 
 
 def align_truth(

@@ -38,7 +38,7 @@ from robot.recordings.cdr import (
 )
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.sanity_checks import clock_errors, first_error, nonfinite_errors, view_errors
-from robot.sources.input_files import digest_of, raise_errors, require_file, unreadable_error
+from robot.sources.input_files import digest_of, raise_errors, readable, require_file
 from robot.sources.source import ClosedSource, Sample, Source, SourceDescription, SourceInfo, rate_of
 from tactile.base.bounded import MOST_BYTES
 from tactile.base.errors import InputError
@@ -82,14 +82,14 @@ def _read_records(file: IO[bytes]) -> Iterator[McapRecord]:
         for record in reader.records:
             left = bounded.left
             if isinstance(record, Chunk):
-                yield from open_chunk(record)
+                yield from _open_chunk(record)
             elif not isinstance(record, (Message, Channel, Schema)):  # without a checksum outside a chunk
                 yield record
     except EndOfFile as error:
         raise _Unclosed if left == 0 else error from None
 
 
-def open_chunk(chunk: Chunk) -> list[McapRecord]:
+def _open_chunk(chunk: Chunk) -> list[McapRecord]:
     """The records in a chunk; raises as `_read_records`."""
     if chunk.compression not in ("zstd", ""):
         raise Malformed(f"a chunk compressed with {chunk.compression!r}")
@@ -188,7 +188,7 @@ def container_fault(path: Path) -> tuple[str, str] | None:
             for record in StreamReader(file, emit_chunks=True).records:
                 if isinstance(record, Header):
                     profile = record.profile or "none"
-                for each in open_chunk(record) if isinstance(record, Chunk) else [record]:
+                for each in _open_chunk(record) if isinstance(record, Chunk) else [record]:
                     if isinstance(each, (Channel, Schema)):
                         codes.add(each.message_encoding if isinstance(each, Channel) else each.encoding)
                 if isinstance(record, (Chunk, Message)):
@@ -243,11 +243,8 @@ class McapScanner:
 
     def entries(self) -> Iterator[RecordingEntry]:
         """All samples and other entries, in their order."""
-        try:
-            with self.path.open("rb") as file:
-                yield from self._entries(file)
-        except OSError as error:
-            raise unreadable_error(self.path, error) from error
+        with readable(self.path), self.path.open("rb") as file:
+            yield from self._entries(file)
 
     def _entries(self, file: IO[bytes]) -> Iterator[RecordingEntry]:
         schemas: dict[int, Schema] = {}
@@ -411,13 +408,12 @@ class Recording(ClosedSource):
         return time[moved]
 
     def __iter__(self) -> Iterator[Sample]:
-        scanner = McapScanner(self.path)
-        for sample in scanner:
-            if scanner.count > self._first + 1 or (self._first == 0 and scanner.count == 1):
-                yield sample
-            elif scanner.count == self._first + 1:  # it begins here
-                still = Odometry(0.0, 0.0, 0.0, 0.0)
+        scanner, still = McapScanner(self.path), Odometry(0.0, 0.0, 0.0, 0.0)
+        for number, sample in enumerate(scanner):
+            if number == self._first > 0:  # it begins here
                 yield sample._replace(reading=sample.reading._replace(odometry=still))
+            elif number >= self._first:
+                yield sample
             if scanner.count == self._last:
                 return
         found = f"had {self._last} samples and now has {scanner.count}"

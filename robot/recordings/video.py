@@ -301,7 +301,13 @@ def video_frames(
 def _opened(path: Path) -> Iterator[tuple[ModuleType, Any]]:
     """OpenCV, and the opened video."""
     require_file(path)
-    cv2 = _opencv()
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # or it prints its own errors beside ours
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    try:
+        import cv2
+    except ModuleNotFoundError:
+        found = "opencv is not installed"
+        raise InputError("video", found, "", "pip install 'ratslam[video]'") from None
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         if not video.isOpened():
@@ -321,14 +327,3 @@ def _times(path: Path, config: VideoConfig, stamps: CsvFile | None, announced: f
         raise InputError(str(path), "no times of its frames", "a frame rate, or a file of stamps", cure)
     rate = config.rate
     return (number / rate for number in itertools.count())
-
-
-def _opencv() -> ModuleType:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # or it prints its own errors beside ours
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
-    try:
-        import cv2
-    except ModuleNotFoundError:
-        found = "opencv is not installed"
-        raise InputError("video", found, "", "pip install 'ratslam[video]'") from None
-    return cv2

@@ -24,7 +24,7 @@ import zstandard
 from robot.recordings.input_judge import GAP, LEAST_GAP
 from robot.recordings.mcap_reader import CONVERT, container_fault
 from robot.recordings.sanity_checks import WHOLE, Stretch, leave_out
-from robot.sources.input_files import missing_error, raise_errors, require_file, unreadable_error
+from robot.sources.input_files import missing_error, raise_errors, readable, require_file
 from tactile.base.bounded import check_size, expand
 from tactile.base.errors import InputError
 
@@ -312,11 +312,10 @@ class Bag:
 def _damage_errors(path: Path) -> Iterator[None]:
     """Turns whatever a reader of damaged bytes raises into an `InputError`."""
     try:
-        yield
+        with readable(path):
+            yield
     except InputError:
         raise
-    except OSError as error:
-        raise unreadable_error(path, error) from error
     except Exception as error:
         found, cure = container_fault(path) or (f"cannot be read as a bag: {_reason(error)}", REPAIR)
         raise InputError(str(path), found, "a whole bag", cure) from error

@@ -40,11 +40,6 @@ def frames_of(message: Any) -> tuple[str, str]:
     return frame.lstrip("/"), child.lstrip("/")
 
 
-def yaw_of(x: float, y: float, z: float, w: float) -> float:
-    """Heading of a quaternion, rad in [-pi, pi]: the direction of its x axis in the plane."""
-    return float(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
-
-
 def pose_in_plane(position: Vector, turn: Quaternion, where: str, plane: str = "xy") -> Vector:
     """(x m, y m, heading rad) of a position (x, y, z) and a quaternion (x, y, z, w).
 
@@ -61,10 +56,10 @@ def pose_in_plane(position: Vector, turn: Quaternion, where: str, plane: str = "
     for name, values in (("orientation", turn), ("position", place)):
         if not np.isfinite(values).all():
             raise InputError(where, f"the {name} is {', '.join(map(str, values))}", "finite numbers")
+    x, y, z, w = turn
     if plane == "xz":
-        x, y, z, w = turn
         return place[1], -place[0], float(np.arctan2(-2 * (x * z + w * y), w * w + z * z - x * x - y * y))
-    return place[0], place[1], yaw_of(*turn)
+    return place[0], place[1], float(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
 
 
 def _pose_at(*fields: str) -> Callable[[Any], tuple[Vector, Quaternion]]:
