@@ -42,7 +42,7 @@ from robot.sources.input_files import digest_of, raise_errors, readable, require
 from robot.sources.source import ClosedSource, Sample, Source, SourceDescription, SourceInfo, rate_of
 from tactile.base.bounded import MOST_BYTES
 from tactile.base.errors import InputError
-from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk
+from tactile.base.types import Observation, Odometry
 
 # Exceptions of the MCAP and zstd libraries and of this package for damaged bytes.
 _DAMAGE_ERRORS = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
@@ -426,15 +426,8 @@ def _checked_values(sample: Sample) -> tuple[float, ...]:
     reading = sample.reading
     truth = (np.nan,) * 3 if sample.truth is None else sample.truth
     low = high = np.nan
-    if isinstance(reading, Cycle):
-        parts = [reading.time, reading.angle, reading.deflection]
-    elif isinstance(reading, Report):
-        parts = [reading.time, reading.strain]
-    elif isinstance(reading, Whisk):
-        parts = [reading.touched, reading.highest, reading.reach]
-    else:
-        parts = [reading.view, reading.point, reading.wall_point, reading.wall_sd]
-        if reading.view_seen:
-            low, high = reading.view.min(), reading.view.max()
+    if isinstance(reading, Observation) and reading.view_seen:
+        low, high = reading.view.min(), reading.view.max()
+    parts = [part for value in reading._replace(odometry=0) if (part := np.asarray(value)).dtype.kind == "f"]
     odd = next((float(part[~good].flat[0]) for part in parts if not (good := np.isfinite(part)).all()), 0.0)
     return (sample.time, *reading.odometry, *truth, low, high, odd, sample.truth is not None)

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from robot.recordings.alignment import judged
 from robot.recordings.csv_file import read_csv
 from robot.recordings.csv_reader import ODOMETRY, align_truth, column_keys, each_nearest, read_csv_recording
-from robot.recordings.input_judge import InputJudge, MotionTrack
+from robot.recordings.input_judge import InputJudge
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import clock_errors
 from robot.recordings.video import VideoConfig, camera_rows, video_frames
@@ -55,20 +56,19 @@ def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
         truth, errors = align_truth(file, config.table.truth, time, judge, same_rows=False)
         raise_errors(errors)
     everywhere = np.ones(len(time), bool)
-    # Visual odometry has no scale, so its lengths cannot be compared with those of the truth.
-    track = MotionTrack(time, everywhere, motion)
-    raise_errors(judge.errors(track, lambda row: f"{path}, frame {row * video.every}", str(path)))
-    return InMemorySource(
+    source = InMemorySource(
         name=path.stem,
-        digest=judge.stretch.digest(digest),
+        digest=digest,
         time=time,
         motion=motion,
         moved=everywhere,
         views=view,
         seen=everywhere,
         label=np.full(len(time), -1, np.int32),
-        truth=truth,
     )
+    place = lambda row: f"{path}, frame {row * video.every}"  # noqa: E731
+    # Visual odometry has no scale, so its lengths cannot be compared with those of the truth.
+    return replace(judged(source, [], judge, str(path), place), truth=truth)
 
 
 def _contradictions(config: RecordingConfig) -> list[InputError]:

@@ -108,11 +108,7 @@ class Bag:
     """
 
     def __init__(
-        self,
-        path: Path,
-        warn: Callable[[str], None] | None = None,
-        stretch: Stretch = WHOLE,
-        clock: Clock = "header",
+        self, path: Path, warn: Callable[[str], None], stretch: Stretch = WHOLE, clock: Clock = "header"
     ) -> None:
         path = path.parent if path.name == METADATA else path
         self.path, self._stack, self._told, self._warn = path, ExitStack(), set[str](), warn
@@ -154,7 +150,7 @@ class Bag:
 
     def warn(self, sentence: str) -> None:
         """Tells a sentence, once."""
-        if self._warn is not None and sentence not in self._told:
+        if sentence not in self._told:
             self._warn(sentence)
         self._told.add(sentence)
 

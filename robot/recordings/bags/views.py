@@ -360,10 +360,7 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str) -> Series:
 
 
 def read_image_views(
-    bag: Bag,
-    topic: Topic,
-    image: ImageViewConfig,
-    visual_odometry: VisualOdometryConfig | None,
+    bag: Bag, topic: Topic, image: ImageViewConfig, visual_odometry: VisualOdometryConfig | None
 ) -> tuple[Series, np.ndarray | None]:
     """Views [M, R, C, 1] of a topic of images, and motions [M, 4] of visual odometry where it is configured;
     one image in memory at a time.
