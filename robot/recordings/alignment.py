@@ -96,19 +96,17 @@ def range_errors(
 
 def nearest_rows(
     moments: np.ndarray, time: np.ndarray, tolerance: float | None
-) -> tuple[np.ndarray, np.ndarray, float] | None:
+) -> tuple[np.ndarray, np.ndarray, float]:
     """The odometry row nearest in time to each of the times [M] s.
 
     Args:
-        time: [N] s of the odometry. tolerance: how far a value may be away, s; None: the median step.
+        time: [N] s of the odometry, increasing. tolerance: how far a value may be away, s; None: the median
+            step.
 
     Returns:
-        The rows [M], how far they are away [M] s, and how far they may be, s;
-        None if the odometry's times do not increase, which is an error of its own.
+        The rows [M], how far they are away [M] s, and how far they may be, s.
     """
     steps = np.diff(time)
-    if not (steps > 0).all():
-        return None
     rows = np.searchsorted(time[:-1] + steps / 2, moments)
     reach = float(np.median(steps)) if tolerance is None and len(steps) else tolerance or 0.0
     return rows, np.abs(time[rows] - moments), reach

@@ -51,7 +51,6 @@ class CsvDescription(NamedTuple):
         max_range: of the views, m; NaN without ranges. missing: what it lacks, in words.
     """
 
-    path: Path
     rows: int
     time: np.ndarray | None
     columns: tuple[tuple[str, float, float], ...]
@@ -73,7 +72,7 @@ def describe_csv(path: Path) -> CsvDescription:
     if time is None or not np.isfinite(file.column(time)).any():
         faults = file.judge([time])[1] if time is not None else []
         missing.append(str(faults[0]) if faults else "a column of times (t, time, stamp)")
-        return CsvDescription(path, len(file.values), None, _columns(file), {}, {}, np.nan, tuple(missing))
+        return CsvDescription(len(file.values), None, _columns(file), {}, {}, np.nan, tuple(missing))
     odometry = _odometry(file)
     units = _units(file, time, odometry or {})
     file = replace(file, clock=units.get("time"))
@@ -108,9 +107,8 @@ def describe_csv(path: Path) -> CsvDescription:
         parts["rate"] = f"rounded times: rows share each, so they are counted instead, {rate:.6g} a second"
         moments = moments[0] + np.arange(len(moments)) / rate
     moments, found = moments[np.isfinite(moments)], table if odometry else {}
-    return CsvDescription(
-        path, len(file.values), moments, _columns(file), parts, found, max_range, tuple(missing)
-    )
+    columns = _columns(file)
+    return CsvDescription(len(file.values), moments, columns, parts, found, max_range, tuple(missing))
 
 
 def _companions(file: CsvFile, time: str) -> list[CsvFile]:

@@ -486,10 +486,9 @@ def each_nearest(
         moments: [M] s, increasing. time: [N] s, of the odometry rows. tolerance: s; None: the median step.
         place: names a row of `moments` in errors.
     """
-    found = nearest_rows(moments, time, tolerance)
-    if found is None:
+    if not (np.diff(time) > 0).all():
         return np.zeros(len(moments), int), []  # the error of the clock is already reported
-    rows, away, reach = found
+    rows, away, reach = nearest_rows(moments, time, tolerance)
     far, cure = away > reach, "raise tolerance, or bring both to one clock"
     one = f"(one of {int(far.sum())} such rows)"
     found_far = lambda i: f"the nearest odometry row is {away[i]:.4g} s away {one}"  # noqa: E731

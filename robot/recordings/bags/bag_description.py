@@ -126,7 +126,6 @@ class BagDescription(NamedTuple):
             whether it is fixed (on /tf_static) and the number of transforms. notes: what is left out.
     """
 
-    path: Path
     topics: tuple[TopicDescription, ...]
     links: tuple[tuple[str, str, bool, int], ...]
     notes: tuple[str, ...] = ()
@@ -149,7 +148,7 @@ def describe_bag(path: Path) -> BagDescription:
             except InputError:
                 continue  # the fault of the topic says why
             links += [(*pair, name == STATIC, len(link)) for pair, link in found.items()]
-    return BagDescription(path, topics, tuple(links), tuple(told))
+    return BagDescription(topics, tuple(links), tuple(told))
 
 
 _ROLES: dict[str, tuple[Role, ...]] = {

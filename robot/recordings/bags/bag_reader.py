@@ -224,9 +224,7 @@ def _place_views(
     bag: Bag, source: dict[str, Any], views: Series, tolerance: float | None
 ) -> list[InputError]:
     """Gives each view to the nearest row of a source; of several for one row the nearest is used."""
-    found = nearest_rows(views.time, source["time"], tolerance)
-    assert found is not None  # the clock is checked
-    rows, away, reach = found
+    rows, away, reach = nearest_rows(views.time, source["time"], tolerance)
     near = away <= reach
     if not near.any():
         return [no_overlap_error(views.time, source["time"], "time", views.where)]

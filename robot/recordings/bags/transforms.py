@@ -332,10 +332,10 @@ def read_poses(bag: Bag, config: PoseTopic, role: str = "truth") -> Series:
             kept.append(value)
     if not rows:
         raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
-    numbers, times, others, pairs, received = ([row[k] for row in rows] for k in range(5))
+    numbers, times, others, pairs, _ = ([row[k] for row in rows] for k in range(5))
     values = np.array(kept).reshape(-1, 3)
     poses = values * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict each other
-    errors = _frame_errors(where, numbers, pairs, role, poses, received, bag)
+    errors = _frame_errors(bag, where, role, rows, poses)
     for doubt, at in doubts.items() if not errors else ():
         bag.warn(f"{at[0]}: {len(at)} of {len(rows)} {doubt}; look at the publisher")
     if not (twist or errors):
@@ -347,20 +347,16 @@ def read_poses(bag: Bag, config: PoseTopic, role: str = "truth") -> Series:
     return series._replace(errors=errors, body=body, held=twist)
 
 
-def _frame_errors(
-    where: str,
-    numbers: list[int],
-    frames: list[Any],
-    role: str,
-    poses: np.ndarray,
-    received: list[int],
-    bag: Bag,
-) -> list[InputError]:
+def _frame_errors(bag: Bag, where: str, role: str, rows: list[Any], poses: np.ndarray) -> list[InputError]:
     """The error for messages of several frames whose poses [M, 3] disagree; those that agree are told.
 
     Several nodes that publish in turn make a path longer than that of each; a change of frame jumps or turns.
-    `received`: times of receipt, ns; the cure of a single change is the longer part beside it.
+    The cure of a single change is the longer part beside it.
+
+    Args:
+        rows: of each message its number, times by both clocks, frames, and time of receipt, ns.
     """
+    numbers, _, _, frames, received = zip(*rows, strict=True)
     counts = Counter(frames)
     if len(counts) < 2:
         return []
