@@ -9,7 +9,7 @@ from __future__ import annotations
 import bz2
 import io
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from copy import copy
 from functools import cached_property
@@ -167,14 +167,14 @@ class Bag:
                 topics[name] = Topic(name, both, max(known.total, totals[name]))
         return dict(sorted(topics.items()))
 
-    def topic(self, name: str, key: str) -> Topic:
+    def topic(self, name: str, key: str, kinds: Iterable[str] = ()) -> Topic:
         """The topic of this name; a leading slash may be missing.
 
         Args:
-            key: configuration key of the name, for errors.
+            key: configuration key of the name, for errors. kinds: types that it can have; () for any.
 
         Raises:
-            InputError: there is no such topic, or it has no messages.
+            InputError: there is no such topic, it has no messages, or another type.
         """
         spellings = (name, f"/{name}", name.removeprefix("/"))
         found = next((self.topics[each] for each in spellings if each in self.topics), None)
@@ -182,6 +182,9 @@ class Bag:
             raise missing_error(str(self.path), "topic", name, list(self.topics), key)
         if not found.total:
             raise InputError(f"{self.path}, {found.name}", "no messages", "at least one message")
+        if kinds and found.kind not in kinds:
+            said = f"messages of type {found.kind}"
+            raise InputError(f"{self.path}, {found.name}", said, f"one of {', '.join(kinds)}")
         return found
 
     def usable(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any, Any]]:

@@ -33,11 +33,8 @@ def _read_touch(bag: Bag, config: TouchTopic) -> Series:
     Raises:
         InputError: the topic does not exist, has another type, or its values do not fill rows and columns.
     """
-    topic = bag.topic(config.topic, "recording.topics.touch")
+    topic = bag.topic(config.topic, "recording.topics.touch", (JOINTS, *ARRAYS))
     where = f"{bag.path}, {topic.name}"
-    if topic.kind not in (JOINTS, *ARRAYS):
-        expected = f"one of {JOINTS}, {', '.join(ARRAYS)}"
-        raise InputError(where, f"messages of type {topic.kind}", expected)
     names, shape, known = config.joints, None, list[str]()
 
     def read(content: Any, place: str) -> np.ndarray | None:

@@ -294,13 +294,11 @@ def read_poses(bag: Bag, config: PoseTopic, role: str = "truth") -> Series:
         series = _poses_between(bag, config.tf, role, config.plane)._replace(body=config.tf[1])
         return series._replace(errors=series.errors + nonfinite_errors(series.values, role, series.place))
     assert config.topic is not None
-    topic = bag.topic(config.topic, f"recording.topics.{role}")
+    known = POSES | TWISTS if role == "odometry" else POSES
+    topic = bag.topic(config.topic, f"recording.topics.{role}", known)
     where = f"{bag.path}, {topic.name}"
     wanted_twist = isinstance(config, OdometryTopic) and (config.use == "twist" or topic.kind not in POSES)
     twist = wanted_twist and topic.kind in TWISTS
-    if topic.kind not in POSES and not twist:
-        known = [*POSES, *TWISTS] if role == "odometry" else [*POSES]
-        raise InputError(where, f"messages of type {topic.kind}", f"one of {', '.join(dict.fromkeys(known))}")
     rows, kept, points, doubts = list[Any](), list[Any](), list[Any](), dict[str, list[str]]()
     wanted = tuple(frame.lstrip("/") for frame in config.frames)
 

@@ -51,26 +51,24 @@ def grey_image(message: Any, kind: str, where: str) -> np.ndarray:
     Raises:
         InputError: the encoding is unknown, or the data are damaged.
     """
-    return _decoded(message, where) if kind == COMPRESSED else _raw(message, where)
-
-
-def _raw(message: Any, where: str) -> np.ndarray:
+    if kind == COMPRESSED:
+        return _decoded(message, where)
     if message.encoding in ("32FC1", "64FC1"):
         raise InputError(where, f"distances ({message.encoding})", "a grey or colour image", _NO_DEPTH)
     if message.encoding not in _ENCODINGS:
         raise InputError(where, f"encoding {message.encoding!r}", f"one of {', '.join(_ENCODINGS)}")
     number, channels = _ENCODINGS[message.encoding]
-    kind = np.dtype((">" if message.is_bigendian else "<") + number)
+    stored = np.dtype((">" if message.is_bigendian else "<") + number)
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)
-    length = width * len(channels) * kind.itemsize
+    length = width * len(channels) * stored.itemsize
     if not (0 < height * width <= LARGEST and length <= step and len(data) >= step * (height - 1) + length):
         found = f"{width} x {height} pixels of {message.encoding}, {step} bytes a row, in {len(data)} bytes"
         raise InputError(where, found, "data that fit their description")
-    strides = (step, len(channels) * kind.itemsize, kind.itemsize)
-    pixels = np.ndarray((height, width, len(channels)), kind, data.tobytes(), strides=strides)
+    strides = (step, len(channels) * stored.itemsize, stored.itemsize)
+    pixels = np.ndarray((height, width, len(channels)), stored, data.tobytes(), strides=strides)
     if channels == "y":
-        grey = (pixels[..., 0] >> 8).astype(np.uint8) if kind.itemsize == 2 else pixels[..., 0].copy()
+        grey = (pixels[..., 0] >> 8).astype(np.uint8) if stored.itemsize == 2 else pixels[..., 0].copy()
         if not message.encoding.startswith("bayer"):
             return grey
         # Means of each pixel and its right and lower neighbours, one of each colour of the Bayer filter.
@@ -323,7 +321,7 @@ LONGEST = 8.0  # m: of indoor scans, most show something nearer
 
 
 def read_range_views(bag: Bag, config: ViewsTopic, body: str) -> Series:
-    """Views [M, R, C, 1] of a topic of scans or clouds.
+    """Views [M, R, C, 1] of a topic of scans or clouds; for images see `read_image_views`.
 
     Args:
         body: frame of the robot; '' if unknown.
@@ -331,11 +329,8 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str) -> Series:
     Raises:
         InputError: the messages are of another type, or do not fit the settings.
     """
-    topic = bag.topic(config.topic, KEY)
+    topic = bag.topic(config.topic, KEY, (SCAN, CLOUD, *IMAGES))
     where = f"{bag.path}, {topic.name}"
-    if topic.kind not in (SCAN, CLOUD):
-        expected = f"one of {', '.join((SCAN, CLOUD, *IMAGES))}"
-        raise InputError(where, f"messages of type {topic.kind}", expected)
     reader = _RangeReader(bag, topic, config, body)
     read = list(bag.stamped(topic, reader.view))
     rows = [row for row in read if row[2] is not None and row[2].covered >= _COVERED]
