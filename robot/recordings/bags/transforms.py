@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
-from itertools import compress, pairwise
+from itertools import compress
 from operator import attrgetter
 from typing import Any, NamedTuple
 
-import networkx as nx
 import numpy as np
 
 from robot.recordings.bags.bag import (
@@ -159,16 +158,16 @@ def read_links(bag: Bag, name: str) -> Links:
 
 def _chain_between(links: Links, parent: str, child: str) -> _Chain | None:
     """The links from one frame to another, each with whether it is followed downwards; None: unconnected."""
-    graph: nx.Graph = nx.Graph()
-    for pair in links:
-        if not graph.has_edge(*pair):
-            graph.add_edge(*pair, link=pair)
-    there = parent != child and {parent, child} <= graph.nodes
-    way = nx.single_source_shortest_path(graph, parent).get(child) if there else None
-    if way is None:
-        return None
-    chain = [(graph.edges[step]["link"], step) for step in pairwise(way)]
-    return [(link, link == step) for link, step in chain]
+    ways: dict[str, _Chain] = {parent: []}
+    frames = deque([parent])
+    while frames:
+        frame = frames.popleft()
+        for upper, lower in links:
+            for here, there, down in ((upper, lower, True), (lower, upper, False)):
+                if here == frame and there not in ways:
+                    ways[there] = [*ways[frame], ((upper, lower), down)]
+                    frames.append(there)
+    return None if parent == child else ways.get(child)
 
 
 def mount_of(bag: Bag, body: str, sensor: str) -> Mount | None:
