@@ -64,8 +64,8 @@ def add_tools(commands: Commands) -> None:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    from robot.recordings.mcap_reader import recover
-    from robot.recordings.mcap_scanner import UNCLOSED
+    from robot.recordings.mcap_reader import UNCLOSED
+    from robot.recordings.mcap_writer import recover
 
     samples, reason = recover(arguments.recording, arguments.output)
     lost = f"; the rest is lost: {reason}" if reason else ""

@@ -119,14 +119,7 @@ def open_recorder(path: Path, source: Source) -> Recorder:
     Raises:
         InputError: the file exists or cannot be created.
     """
-    return Recorder(
-        path,
-        view_shape=source.view_shape,
-        whiskers=source.whiskers,
-        rate_hz=source.rate_hz,
-        info=source.info,
-        chunk_s=CHUNK / (source.rate_hz or 1.0),
-    )
+    return Recorder(path, source, chunk_s=CHUNK / (source.rate_hz or 1.0))
 
 
 class _Interrupts:

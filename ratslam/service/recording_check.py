@@ -31,15 +31,7 @@ from ratslam.runs.settings.strict_yaml import (
 from ratslam.service.record_fit import shows_place
 from ratslam.service.rig_fit import aligned
 from robot.recordings.bags.bag import METADATA
-from robot.recordings.bags.bag_description import (
-    CloudShape,
-    ImageShape,
-    MotionShape,
-    ScanShape,
-    Shape,
-    Times,
-    ValueShape,
-)
+from robot.recordings.bags.bag_description import Times
 from robot.recordings.bags.views import CLOUD, IMAGES, LONGEST, SCAN
 from robot.recordings.input_judge import MotionTrack, typical_motion
 from robot.recordings.video import SUFFIXES as VIDEOS
@@ -88,7 +80,7 @@ def _describe_file(path: Path) -> _FileContents:
     Raises:
         InputError: it is missing, damaged, or of no known format.
     """
-    from robot.recordings.mcap_scanner import is_foreign
+    from robot.recordings.mcap_reader import is_foreign
     from robot.recordings.npz_trace import array_shapes
 
     if not path.exists():
@@ -134,18 +126,15 @@ def _describe_csv(path: Path) -> _FileContents:
 
 
 def _describe_bag(path: Path) -> _FileContents:
-    from robot.recordings.bags.bag_description import describe_bag
-    from robot.recordings.bags.topic_suggestion import robots_of, suggested_topics
+    from robot.recordings.bags.bag_description import describe_bag, robots_of, suggested_topics
 
     found = describe_bag(path)
     rows = [("topic", "type", "messages", "Hz", "holds", "serves as")]
     notes, faults = list(found.notes), []
     for topic in found.topics:
         clock = topic.stamped or topic.received
-        roles = ", ".join(topic.roles) or "-"
-        rows.append(
-            (topic.name, topic.kind, str(topic.total), f"{clock.rate_hz:.3g}", _in_words(topic.shape), roles)
-        )
+        roles, words = ", ".join(topic.roles) or "-", topic.shape.words if topic.shape else ""
+        rows.append((topic.name, topic.kind, str(topic.total), f"{clock.rate_hz:.3g}", words, roles))
         if topic.roles:
             notes += _clock_notes(topic.name, clock)
     moving = [f"{parent} -> {child}" for parent, child, fixed, _ in found.links if not fixed]
@@ -178,16 +167,18 @@ def _describe_bag(path: Path) -> _FileContents:
         notes.append(NO_WHEELS)
     views = topics.get("views")
     seen = views if isinstance(views, str) or views is None else views["topic"]
-    shape = next((topic.shape for topic in found.topics if topic.name == seen), None)
+    kind, shape = next(((each.kind, each.shape) for each in found.topics if each.name == seen), ("", None))
     fov, reach = None, np.nan  # the range that becomes 1 in the views, m; of images there is none
-    if isinstance(shape, ScanShape):
+    if shape is not None and shape.extent is not None:
         fov = 2 * np.pi if shape.extent.ring else shape.extent.width
         reach = min(shape.high, LONGEST)
-    elif isinstance(shape, CloudShape):
+    elif kind == CLOUD:
         reach = LONGEST
-    if isinstance(shape, ImageShape) and (shape.height < SMALL.rows or shape.width < SMALL.columns):
-        size = {"rows": min(shape.height, SMALL.rows), "columns": min(shape.width, SMALL.columns)}
-        recording["image"] = size
+    elif shape is not None and kind in IMAGES:
+        width, height = shape.size
+        if height < SMALL.rows or width < SMALL.columns:
+            size = {"rows": min(height, SMALL.rows), "columns": min(width, SMALL.columns)}
+            recording["image"] = size
     return _FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), reach, fov)
 
 
@@ -205,26 +196,6 @@ def _clock_notes(name: str, clock: Times) -> list[str]:
     if clock.rate_hz and clock.gap > LONG_GAP / clock.rate_hz:
         notes.append(f"{name}: longest gap {clock.gap:.3g} s after {clock.gap_at:.6f} s")
     return notes
-
-
-def _in_words(shape: Shape | None) -> str:
-    """What the messages of a topic hold."""
-    match shape:
-        case ScanShape():
-            width = np.degrees(abs(shape.extent.width))
-            turn = "all around" if shape.extent.ring else f"over {width:.0f} degrees"
-            return f"{shape.beams} beams {turn}, median {shape.median:.2g} m, {shape.nothing:.0%} empty"
-        case CloudShape():
-            return f"{shape.points} points, median {shape.reach:.2g} m away"
-        case ImageShape():
-            return f"{shape.width} x {shape.height} {shape.encoding}, mean grey {shape.grey:.0f}"
-        case ValueShape():
-            return f"{' x '.join(map(str, shape.sizes))} values from {shape.low:.3g} to {shape.high:.3g}"
-        case MotionShape():
-            poses, twists = (shape.pose_path, shape.pose_speed), (shape.twist_path, shape.twist_speed)
-            path, speed = poses if np.isfinite(shape.pose_path) else twists
-            return f"{path:.3g} m at {speed:.2g} m/s"
-    return ""
 
 
 def _describe_video(path: Path) -> _FileContents:

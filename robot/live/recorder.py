@@ -16,22 +16,9 @@ import numpy as np
 
 from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames
 from robot.drivers.outcome import Fault, SessionOutcome
-from robot.recordings.cdr import (
-    ARM,
-    CUT,
-    EVENT,
-    FRAMES,
-    TRUTH,
-    Event,
-    encode,
-    encode_cut,
-    encode_event,
-    encode_frames,
-    encode_states,
-    encode_truth,
-)
-from robot.recordings.mcap_writer import McapWriter, RecordingWriteError
-from robot.sources.source import Sample, SourceInfo
+from robot.recordings.cdr import Event
+from robot.recordings.mcap_writer import Recorder, RecordingWriteError
+from robot.sources.source import Sample, SourceDescription, SourceInfo
 
 BLOCK_TIME = 0.15
 """Time for which frames and states are collected into a block, s."""
@@ -44,7 +31,7 @@ class LiveRecorder:
     ignored, and the recording stays readable up to that point.
 
     Args:
-        path: must not exist yet. view_shape, whiskers, rate_hz, info: see `McapWriter`.
+        path: must not exist yet. view_shape, whiskers, rate_hz, info: see `Recorder`.
 
     Attributes:
         fault: the error that ended writing, or None.
@@ -63,7 +50,7 @@ class LiveRecorder:
         info: SourceInfo,
     ) -> None:
         self.fault: Fault | None = None
-        self._tape = McapWriter(path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, info=info)
+        self._tape = Recorder(path, SourceDescription(view_shape, whiskers, rate_hz, info))
         self._lock = Lock()
         self._frames: list[Frames] = []
         self._states: list[np.ndarray] = []
@@ -110,20 +97,12 @@ class LiveRecorder:
                 self._arrival = max(self._arrival, cut.time)
                 self._gather(mine)
                 self._write()
-                if truth is not None:
-                    self._tape.append(TRUTH, cut.time, encode_truth(cut.time, truth))
-                self._tape.append(CUT, cut.time, encode_cut(cut))
+                self._tape.write(cut, truth)
                 self._tape.flush()
 
     def add_sample(self, sample: Sample) -> None:
         """Adds a reading that holds all that was measured, after the frames so far, and flushes the file."""
-        described = self._tape.description
-        name, message = encode(sample, described.view_shape, described.whiskers)
-        with self._writing(sample.time) as able:
-            if able:
-                self._write()
-                self._tape.append(name, sample.time, message)
-                self._tape.flush()
+        self._add(sample)
 
     def add_event(self, time: float, name: str, text: str) -> None:
         """Adds an event and flushes the file.
@@ -131,11 +110,13 @@ class LiveRecorder:
         Args:
             time: s. name: one word. text: details.
         """
-        message = encode_event(Event(time, name, text))
-        with self._writing(time) as able:
+        self._add(Event(time, name, text))
+
+    def _add(self, content: Sample | Event) -> None:
+        with self._writing(content.time) as able:
             if able:
                 self._write()
-                self._tape.append(EVENT, time, message)
+                self._tape.write(content)
                 self._tape.flush()
 
     def close(self) -> None:
@@ -164,10 +145,9 @@ class LiveRecorder:
         if self._frames:
             parts = zip(*self._frames, strict=True)
             block = Frames(*(np.concatenate(part) for part in parts))
-            self._tape.append(FRAMES, self._arrival, encode_frames(self._arrival, block))
+            self._tape.write(block, arrival=self._arrival)
         if self._states:
-            states = np.concatenate(self._states)
-            self._tape.append(ARM, float(states["host"][-1]), encode_states(states))
+            self._tape.write(np.concatenate(self._states))
         self._frames, self._states, self._since = [], [], -np.inf
 
     @contextmanager

@@ -2,100 +2,64 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import replace
 from math import prod
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from robot.recordings.input_judge import Cures, InputJudge, MotionTrack, unit_cure
+from robot.recordings.input_judge import Cures, InputJudge, MotionTrack
 from robot.recordings.sanity_checks import RowName, first_error
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import raise_errors
-from robot.sources.source import PlanarWhiskersInfo, SourceInfo
 from tactile.base.bounded import MOST_PIXELS
 from tactile.base.errors import InputError
 
 
-@dataclass(eq=False)
-class RecordingRows:
-    """Rows of a recording while it is put together; N rows of odometry.
+def blank_rows(
+    path: Path, time: np.ndarray, motion: np.ndarray, shape: tuple[int, int, int]
+) -> dict[str, Any]:
+    """The arguments of an `InMemorySource` with odometry [N, 4] at times [N] s, and nothing else.
 
-    Attributes:
-        where: names the recording. time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s) since the
-            previous row.
-        shape: (R, C, 1) of every view. whiskers: W touch sensors, 0 for cameras and lasers.
-        errors: found so far. held: whether the odometry was recorded as velocities. poses: [N, 3] as
-            recorded, where poses were. place: names a row; None: by its number. cures: of wrong units.
-        views, seen, label, truth, contact, point: as in `InMemorySource`. sensors: the whiskers that make
-            contacts, if any.
+    Args:
+        shape: (R, C, 1) of the views.
+
+    Raises:
+        InputError: these are too many pixels.
     """
+    rows = len(time)
+    if rows * prod(shape) > MOST_PIXELS:
+        found = f"{rows} views of {prod(shape)} pixels"
+        raise InputError(str(path), found, f"at most {MOST_PIXELS} pixels in all", "lower rows or columns")
+    blank = {"views": np.zeros((rows, *shape)), "seen": np.zeros(rows, bool), "moved": np.ones(rows, bool)}
+    blank |= {"label": np.full(rows, -1, np.int32), "time": time, "motion": motion}
+    return {"name": path.stem, "truth": None, **blank}
 
-    where: str
-    time: np.ndarray
-    motion: np.ndarray
-    shape: tuple[int, int, int]
-    whiskers: int = 0
-    errors: list[InputError] = field(default_factory=list)
-    held: bool = False
-    poses: np.ndarray | None = None
-    place: RowName | None = None
-    cures: Cures = unit_cure
-    truth: np.ndarray | None = None
-    contact: np.ndarray | None = None
-    point: np.ndarray | None = None
-    sensors: PlanarWhiskersInfo | None = None
-    views: np.ndarray = field(init=False)
-    seen: np.ndarray = field(init=False)
-    label: np.ndarray = field(init=False)
 
-    def __post_init__(self) -> None:
-        rows, pixels = len(self.time), prod(self.shape)
-        if rows * pixels > MOST_PIXELS:
-            found = f"{rows} views of {pixels} pixels"
-            raise InputError(
-                self.where, found, f"at most {MOST_PIXELS} pixels in all", "lower rows or columns"
-            )
-        self.views, self.seen = np.zeros((rows, *self.shape)), np.zeros(rows, bool)
-        self.label = np.full(rows, -1, np.int32)
+def judged(
+    source: InMemorySource,
+    errors: list[InputError],
+    judge: InputJudge,
+    where: str,
+    place: RowName | None = None,
+    held: bool = False,
+    poses: np.ndarray | None = None,
+    cures: Cures | None = None,
+) -> InMemorySource:
+    """A recording after it was judged; its digest is that of the stretch that was read.
 
-    def set_contacts(self, rows: np.ndarray, touching: np.ndarray, sensors: PlanarWhiskersInfo) -> None:
-        """Contacts [M, W] bool of the tips of whiskers at M rows, and none at the others."""
-        self.sensors, self.whiskers = sensors, len(sensors.mounts)
-        self.contact = np.zeros((len(self.time), self.whiskers), bool)
-        self.contact[rows] = touching
-        base, angle = np.array(sensors.mounts)[:, :2], np.radians(np.array(sensors.mounts)[:, 2])
-        tips = base + sensors.length * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        self.point = tips * self.contact[:, :, None]
+    Args:
+        errors: found so far. place, cures: as for `InputJudge.errors`; rows are named by their number by
+            default. held, poses: as in `MotionTrack`.
 
-    def source(self, name: str, digest: str, judge: InputJudge) -> InMemorySource:
-        """The recording as a `Source`, after it was judged.
-
-        Raises:
-            InputError: rows have errors, or the odometry cannot be believed.
-        """
-        everywhere = np.ones(len(self.time), bool)
-        track = MotionTrack(self.time, everywhere, self.motion, self.truth, self.held, self.poses)
-        place = self.place or (lambda row: f"{self.where}, row {row}")
-        judged = judge.errors(track, place, self.where, cures=self.cures, in_order=not self.errors)
-        raise_errors(self.errors + judged)
-        return InMemorySource(
-            name=name,
-            digest=judge.stretch.digest(digest),
-            time=self.time,
-            motion=self.motion,
-            moved=everywhere,
-            views=self.views,
-            seen=self.seen,
-            label=self.label,
-            truth=self.truth,
-            info=SourceInfo(
-                labels_only=bool((self.label >= 0).any()) and not self.seen.any(),
-                planar_whiskers=self.sensors,
-            ),
-            alive=np.ones(self.whiskers, bool),
-            contact=self.contact,
-            point=self.point,
-        )
+    Raises:
+        InputError: rows have errors, or the odometry cannot be believed.
+    """
+    track = MotionTrack(source.time, source.moved, source.motion, source.truth, held, poses)
+    place = place or (lambda row: f"{where}, row {row}")
+    raise_errors([*errors, *judge.errors(track, place, where, cures=cures, in_order=not errors)])
+    return replace(source, digest=judge.stretch.digest(source.digest))
 
 
 def range_pixels(
@@ -132,19 +96,17 @@ def range_errors(
 
 def nearest_rows(
     moments: np.ndarray, time: np.ndarray, tolerance: float | None
-) -> tuple[np.ndarray, np.ndarray, float] | None:
+) -> tuple[np.ndarray, np.ndarray, float]:
     """The odometry row nearest in time to each of the times [M] s.
 
     Args:
-        time: [N] s of the odometry. tolerance: how far a value may be away, s; None: the median step.
+        time: [N] s of the odometry, increasing. tolerance: how far a value may be away, s; None: the median
+            step.
 
     Returns:
-        The rows [M], how far they are away [M] s, and how far they may be, s;
-        None if the odometry's times do not increase, which is an error of its own.
+        The rows [M], how far they are away [M] s, and how far they may be, s.
     """
     steps = np.diff(time)
-    if not (steps > 0).all():
-        return None
     rows = np.searchsorted(time[:-1] + steps / 2, moments)
     reach = float(np.median(steps)) if tolerance is None and len(steps) else tolerance or 0.0
     return rows, np.abs(time[rows] - moments), reach

@@ -102,17 +102,7 @@ string event        # its name, ': ', what was found
 (OBSERVATION, CYCLE, WHISK, REPORT, TRUTH, CUT, FRAMES, ARM, EVENT) = SCHEMAS
 READINGS = (OBSERVATION, CYCLE, WHISK, REPORT, CUT)
 """Messages that make a sample."""
-TOPICS = {
-    OBSERVATION: "/ratslam/observation",
-    CYCLE: "/ratslam/cycle",
-    WHISK: "/ratslam/whisk",
-    REPORT: "/ratslam/report",
-    TRUTH: "/ratslam/truth",
-    CUT: "/ratslam/cut",
-    FRAMES: "/ratslam/frames",
-    ARM: "/ratslam/arm",
-    EVENT: "/ratslam/event",
-}
+TOPICS = {name: f"/ratslam/{name.rsplit('/')[-1].lower()}" for name in SCHEMAS}
 SCHEMA_OF = {topic: name for name, topic in TOPICS.items()}
 
 
@@ -122,9 +112,17 @@ _FEATURES = ("touched", "highest", "reach")
 """Values of each whisker in the field `felt` of a Whisk message."""
 FLAGS = {OBSERVATION: ("contact", "dead"), WHISK: ("alive", "contact", "held"), REPORT: ("alive", "contact")}
 """Meaning of the bits of `flags`, from the lowest."""
-_SAMPLES_AT = {CYCLE: 44, REPORT: 56}
-"""Byte position of the number of samples in a message."""
-_TYPES = {"float64": "<f8", "int32": "<i4", "uint32": "<u4", "uint8": "u1", "bool": "?"}
+_KINDS: dict[str, Any] = {OBSERVATION: Observation, CYCLE: Cycle, WHISK: Whisk, REPORT: Report}
+_COUNTS = {CYCLE: ("samples", 44), REPORT: ("samples", 56), FRAMES: ("frames", 12), ARM: ("states", 12)}
+"""The field with the number of samples, frames or states in a message, and its byte position."""
+NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")
+WORDS = ("mode", "safety", "runtime", "operation", "progress")
+"""Fields of an arm state: floating-point numbers and 32-bit words, in the order of the message."""
+_WIDTHS = [ARM_STATE[field].itemsize // 8 for field in NUMBERS]
+_TYPES = {
+    **{"float64": "<f8", "int64": "<i8", "int32": "<i4", "uint32": "<u4", "int16": "<i2"},
+    **{"uint8": "u1", "bool": "?"},
+}
 """NumPy types of the types in `SCHEMAS`."""
 
 
@@ -132,98 +130,164 @@ class Malformed(ValueError):
     """A message that does not fit its schema."""
 
 
-class _Layout(NamedTuple):
-    """Byte layout of a message.
+class Event(NamedTuple):
+    """An event of a live session. Attributes: time: s. name: one word, such as `fault` or `discontinuity`.
+    text: details."""
 
-    Attributes:
-        dtype: the message as a packed record. blank: a message with lengths and shapes filled in.
-        fixed: (start, stop, bytes) of all parts that are equal in every message of this layout.
-        fields: names of the variable fields.
-    """
-
-    dtype: np.dtype
-    blank: np.ndarray
-    fixed: tuple[tuple[int, int, bytes], ...]
-    fields: tuple[str, ...]
+    time: float
+    name: str
+    text: str
 
 
-def encode(sample: Sample, view_shape: tuple[int, int, int], whiskers: int) -> tuple[str, bytes]:
-    """A sample's reading as (schema, message).
+def encode(
+    content: Sample | Cut | Frames | np.ndarray | Event,
+    view_shape: tuple[int, int, int],
+    whiskers: int,
+    arrival: float = np.nan,
+) -> tuple[str, float, bytes]:
+    """A part of a recording as (schema, time in s, message).
+
+    Args:
+        content: a sample, whose truth is left out; a cut, frames, arm states [N] (`ARM_STATE`), N > 0, or an
+            event.
+        arrival: of frames, when the newest of them came, s.
 
     Raises:
         InputError: a field has another shape, or values that its type cannot hold exactly.
     """
-    reading = sample.reading
-    names = {Observation: OBSERVATION, Cycle: CYCLE, Whisk: WHISK, Report: REPORT}
-    name, samples = names[type(reading)], 0
+    if isinstance(content, Event):
+        if ": " in content.name:
+            raise ValueError(f"a colon in the event name {content.name!r}")
+        text = f"{content.name}: {content.text}".encode() + b"\0"
+        return EVENT, content.time, struct.pack("<4sdI", CDR, content.time, len(text)) + text
+    count = 0
+    values: dict[str, Any]
+    if isinstance(content, Sample):
+        name, count, values = _of_reading(content, whiskers)
+    elif isinstance(content, Cut):
+        name, values = CUT, content._asdict() | content.odometry._asdict()
+    elif isinstance(content, Frames):
+        name, count = FRAMES, len(content.sequence)
+        counts = np.moveaxis(content.values, 0, -1)
+        values = {"time": arrival, "sequence": _steps(content.sequence), "flags": content.flags}
+        values |= {"device_time": _steps(content.time), "values": _steps(counts)}
+    else:
+        name, count = ARM, len(content)
+        values = {"time": content["host"][-1], "counter": content["counter"].astype("<i8")}
+        values["number"] = np.concatenate([content[field].reshape(count, -1).T for field in NUMBERS])
+        values["word"] = np.stack([content[field].astype("<i4") for field in WORDS])
+    dtype, blank, _, fields = _message_layout(name, view_shape, whiskers, count)
+    record = blank.copy()
+    for field in fields:
+        record[field] = _convert_exactly(field, values[field], dtype[field])
+    return name, float(values["time"]), record.tobytes()
+
+
+def _of_reading(sample: Sample, whiskers: int) -> tuple[str, int, dict[str, Any]]:
+    """The schema of a sample's reading, its number of samples, and its values by field."""
+    reading, count = sample.reading, 0
+    name = {kind: name for name, kind in _KINDS.items()}[type(reading)]
     values: dict[str, Any] = {**reading._asdict(), **reading.odometry._asdict()}
+    booleans = np.dtype(("?", (whiskers,)))
     if isinstance(reading, Cycle | Report):
-        samples, values["sample_time"] = len(np.atleast_1d(reading.time)), reading.time
+        count, values["sample_time"] = len(np.atleast_1d(reading.time)), reading.time
     elif isinstance(reading, Whisk):
         numbers = np.dtype(("<f8", (whiskers,)))
         columns = [_convert_exactly(field, values[field], numbers) for field in _FEATURES]
         values["felt"] = np.stack(columns, axis=1)
     else:
-        values["dead"] = ~_convert_exactly("alive", reading.alive, np.dtype(("?", (whiskers,)))).astype(bool)
-    layout = _message_layout(name, view_shape, whiskers, samples)
+        values["dead"] = ~_convert_exactly("alive", reading.alive, booleans).astype(bool)
     if name in FLAGS:
-        flags, booleans = np.zeros(whiskers, np.uint8), np.dtype(("?", (whiskers,)))
+        flags = np.zeros(whiskers, np.uint8)
         for bit, field in enumerate(FLAGS[name]):
             flags |= _convert_exactly(field, values[field], booleans).astype(np.uint8) << bit
         values["flags"] = flags
-    values["time"] = sample.time
-    record = layout.blank.copy()
-    for field in layout.fields:
-        record[field] = _convert_exactly(field, values[field], layout.dtype[field])
-    return name, record.tobytes()
+    return name, count, values | {"time": sample.time}
 
 
 def decode(name: str, message: bytes, view_shape: tuple[int, int, int], whiskers: int) -> tuple[float, Any]:
-    """(time, reading) of a message; the inverse of `encode`.
+    """(time, content) of a message; the inverse of `encode`: of a sample its reading, of a truth [3].
 
     Raises:
         Malformed: the message does not fit this schema, view shape and number of whiskers.
     """
-    samples = 0
-    if name in _SAMPLES_AT:
-        samples = int.from_bytes(message[_SAMPLES_AT[name] :][:4], "little")
-        if samples * (1 + 3 * whiskers) > MAX_NUMBERS:
-            raise Malformed(f"a message of {samples} samples")
-    layout = _message_layout(name, view_shape, whiskers, samples)
-    if len(message) != layout.dtype.itemsize:
-        raise Malformed(f"a message of {len(message)} bytes where {layout.dtype.itemsize} were expected")
-    if any(message[start:stop] != content for start, stop, content in layout.fixed):
+    if name == EVENT:
+        return _decode_event(message)
+    count = 0
+    if name in _COUNTS:
+        count = int.from_bytes(message[_COUNTS[name][1] :][:4], "little")
+        if 8 * count > len(message) or count * (1 + 3 * whiskers) > MAX_NUMBERS:
+            raise Malformed(f"a message of {count} {_COUNTS[name][0]}")
+    dtype, _, fixed, _ = _message_layout(name, view_shape, whiskers, count)
+    if len(message) != dtype.itemsize:
+        raise Malformed(f"a message of {len(message)} bytes where {dtype.itemsize} were expected")
+    if any(message[start:stop] != content for start, stop, content in fixed):
         raise Malformed("a message with another shape than the recording's")
-    record = np.frombuffer(message, layout.dtype)[0]
+    record = np.frombuffer(message, dtype)[0]
+    time = float(record["time"])
+    if name == TRUTH:
+        return time, np.array([record["x"], record["y"], record["heading"]])
+    if name == FRAMES:
+        return time, _frames(record)
+    if name == ARM:
+        return time, _states(record, count)
     odometry = Odometry(record["dx"], record["dy"], record["dtheta"], record["dt"])
-    if name == CYCLE:
-        time, angle, deflection = (record[field].copy() for field in ("sample_time", "angle", "deflection"))
-        return float(record["time"]), Cycle(time, angle, deflection, odometry)
-    bits, names = record["flags"], FLAGS[name]
-    if (bits >> len(names)).any():
-        most = 2 ** len(names) - 1
-        raise Malformed(f"whisker flags {int(bits.max())} where {most} is the largest possible")
-    flags = {field: (bits >> bit & 1).astype(bool) for bit, field in enumerate(names)}
-    if name == WHISK:
-        felt = {field: record["felt"][:, k].copy() for k, field in enumerate(_FEATURES)}
-        return float(record["time"]), Whisk(odometry=odometry, **flags, **felt)
+    if name == CUT:
+        number, first, last, frames = (int(record[field]) for field in ("number", "first", "last", "frames"))
+        start, seen = float(record["start"]), bool(record["seen"])
+        return time, Cut(number, time, start, first, last, frames, odometry, seen)
+    kind = _KINDS[name]
+    fields = [field for field in kind._fields if field in (dtype.names or ())]
+    values = {field: record[field].copy() for field in fields}  # copies are aligned and writable
+    for bit, field in enumerate(FLAGS.get(name, ())):
+        values[field] = (record["flags"] >> bit & 1).astype(bool)
+    if name in FLAGS and (record["flags"] >> len(FLAGS[name])).any():
+        most = 2 ** len(FLAGS[name]) - 1
+        raise Malformed(f"whisker flags {int(record['flags'].max())} where {most} is the largest possible")
+    if name == OBSERVATION:
+        values["alive"] = ~values.pop("dead")
+    elif name == WHISK:
+        values |= {field: record["felt"][:, k].copy() for k, field in enumerate(_FEATURES)}
+    else:
+        values["time"] = record["sample_time"].copy()
     if name == REPORT:
-        time, strain = record["sample_time"].copy(), record["strain"].copy()
-        moved, ended = int(record["motion"]), int(record["moment"])
-        return float(record["time"]), Report(odometry, moved, ended, **flags, time=time, strain=strain)
-    return float(record["time"]), Observation(
-        odometry=odometry,
-        motion=record["motion"],
-        view=record["view"].copy(),  # copies are aligned and writable
-        view_seen=record["view_seen"],
-        label=record["label"],
-        contact=flags["contact"],
-        alive=~flags["dead"],
-        point=record["point"].copy(),
-        wall=record["wall"],
-        wall_point=record["wall_point"].copy(),
-        wall_sd=record["wall_sd"],
+        values |= {field: int(record[field]) for field in ("motion", "moment")}
+    return time, kind(odometry=odometry, **values)
+
+
+def _frames(record: Any) -> Frames:
+    flags = record["flags"]
+    if (flags > 255).any():
+        raise Malformed(f"frame flags {int(flags.max())} where 255 is the largest possible")
+    values = np.cumsum(record["values"], axis=-1, dtype=np.int16)
+    return Frames(
+        np.cumsum(record["sequence"], dtype=np.int64),
+        np.cumsum(record["device_time"], dtype=np.int64),
+        flags.astype(np.uint8),
+        np.ascontiguousarray(np.moveaxis(values, -1, 0)),
     )
+
+
+def _states(record: Any, count: int) -> np.ndarray:
+    states = np.zeros(count, ARM_STATE)
+    states["counter"] = record["counter"]
+    columns = np.split(record["number"], np.cumsum(_WIDTHS)[:-1])
+    for field, column in zip(NUMBERS, columns, strict=True):
+        states[field] = column.T.reshape(states[field].shape)
+    for field, word in zip(WORDS, record["word"], strict=True):
+        states[field] = word.astype(ARM_STATE[field])
+    return states
+
+
+def _decode_event(message: bytes) -> tuple[float, Event]:
+    head, text = message[:16], message[16:]
+    if len(head) < 16 or head[:4] != CDR or int.from_bytes(head[12:], "little") != len(text):
+        raise Malformed("an event of another length than it says")
+    name, colon, found = text[:-1].decode().partition(": ")
+    if not (colon and text.endswith(b"\0")):
+        raise Malformed("an event without a name")
+    (time,) = struct.unpack("<d", head[4:12])
+    return time, Event(time, name, found)
 
 
 def encode_truth(time: float, truth: np.ndarray) -> bytes:
@@ -231,50 +295,51 @@ def encode_truth(time: float, truth: np.ndarray) -> bytes:
     return CDR + np.array([time, *_convert_exactly("truth", truth, np.dtype(("<f8", (3,))))], "<f8").tobytes()
 
 
-def decode_truth(message: bytes) -> tuple[float, np.ndarray]:
-    """(time, truth [3]); raises `Malformed`."""
-    if len(message) != 36 or not message.startswith(CDR):
-        raise Malformed("malformed Truth message")
-    time, *pose = np.frombuffer(message, "<f8", offset=4)
-    return float(time), np.array(pose)
-
-
 @lru_cache(maxsize=512)
-def _message_layout(name: str, view_shape: tuple[int, int, int], whiskers: int, samples: int) -> _Layout:
-    """The packed form of the schema of a reading for these sizes."""
+def _message_layout(
+    name: str, view_shape: tuple[int, int, int], whiskers: int, count: int
+) -> tuple[np.dtype, np.ndarray, list[tuple[int, int, bytes]], list[str]]:
+    """The byte layout of a message of this schema, for these sizes: the message as a packed record; a record
+    with lengths and shapes filled in; (start, stop, bytes) of all parts that are equal in every message of
+    this layout; names of the variable fields."""
     shapes = {
         "view": view_shape,
         "point": (whiskers, 2),
-        "flags": (whiskers,),
+        "flags": (count,) if name == FRAMES else (whiskers,),
         "felt": (whiskers, len(_FEATURES)),
-        "sample_time": (samples,),
-        "angle": (samples, whiskers),
-        "deflection": (samples, whiskers, 2),
-        "strain": (samples, whiskers, 2),
+        "angle": (count, whiskers),
+        "deflection": (count, whiskers, 2),
+        "strain": (count, whiskers, 2),
+        "values": (whiskers, CHANNELS, count),
+        "number": (sum(_WIDTHS), count),
+        "word": (len(WORDS), count),
+        **dict.fromkeys(("sample_time", "sequence", "device_time", "counter"), (count,)),
     }
+    sizes: dict[str, Any] = {"view_shape": view_shape, "whiskers": whiskers, "axes": 2, "channels": CHANNELS}
+    sizes |= {"numbers": sum(_WIDTHS), "words": len(WORDS)}
+    if name in _COUNTS:
+        sizes[_COUNTS[name][0]] = count
     fixed: dict[str, Any] = {"cdr": list(CDR)}
     fields: list[tuple[str, str, tuple[int, ...]]] = [("cdr", "u1", (4,))]
     for line in SCHEMAS[name].splitlines():
         kind, field = line.split()[:2]
         base, _, size = kind.partition("[")
+        shape: tuple[int, ...] = (int(size[:-1]),) if size[:-1] else ()
         if size == "]":
-            fixed[f"{field}_length"] = int(np.prod(shapes[field]))
+            shape = shapes[field]
+            fixed[f"{field}_length"] = int(np.prod(shape))
             fields.append((f"{field}_length", "<u4", ()))
-        fields.append((field, _TYPES[base], (int(size[:-1]),) if size[:-1] else shapes.get(field, ())))
-    sizes = {"view_shape": view_shape, "whiskers": whiskers, "samples": samples, "axes": 2}
+        elif field in sizes:
+            fixed[field] = sizes[field]
+        fields.append((field, _TYPES[base], shape))
     dtype = np.dtype(fields)
-    fixed |= {field: size for field, size in sizes.items() if field in (dtype.names or ())}
     blank = np.zeros((), dtype)
     for field, value in fixed.items():
         blank[field] = value
     content = blank.tobytes()
     places = [(dtype.fields[field][1], dtype[field].itemsize) for field in fixed]  # type: ignore[index]
-    return _Layout(
-        dtype=dtype,
-        blank=blank,
-        fixed=tuple((start, start + size, content[start : start + size]) for start, size in places),
-        fields=tuple(field for field, *_ in fields if field not in fixed),
-    )
+    parts = [(start, start + size, content[start : start + size]) for start, size in places]
+    return dtype, blank, parts, [field for field, *_ in fields if field not in fixed]
 
 
 def _convert_exactly(name: str, value: Any, dtype: np.dtype) -> np.ndarray:
@@ -291,179 +356,6 @@ def _convert_exactly(name: str, value: Any, dtype: np.dtype) -> np.ndarray:
     return array
 
 
-NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")
-WORDS = ("mode", "safety", "runtime", "operation", "progress")
-"""Fields of an arm state: floating-point numbers and 32-bit words, in the order of the message."""
-
-
-class Event(NamedTuple):
-    """An event of a live session. Attributes: time: s. name: one word, such as `fault` or `discontinuity`.
-    text: details."""
-
-    time: float
-    name: str
-    text: str
-
-
-def encode_frames(time: float, frames: Frames) -> bytes:
-    """Encode a block of frames; `time` is the arrival of the newest one, s."""
-    count, whiskers, channels = frames.values.shape
-    planes = frames.values.reshape(count, whiskers * channels).T
-    parts = [
-        struct.pack("<4sd2I", CDR, time, count, count),
-        _encode_steps(frames.sequence, "<i8"),
-        struct.pack("<2I", whiskers, count),
-        _encode_steps(frames.time, "<i8"),
-        struct.pack("<2I", channels, count),
-        frames.flags.astype("<u4").tobytes(),
-        struct.pack("<I", planes.size),
-        _encode_steps(planes, "<i2"),
-    ]
-    return b"".join(parts)
-
-
-def decode_frames(message: bytes, whiskers: int) -> tuple[float, Frames]:
-    """Decode (time, frames) of a head with this number of whiskers; raises `Malformed`."""
-    fields = _Fields(message)
-    time = fields.number("<d")
-    count = fields.size()
-    sequence = fields.array("<i8", count)
-    if fields.size() != whiskers:
-        raise Malformed(f"frames with another number of whiskers than the recording, {whiskers}")
-    device = fields.array("<i8", count)
-    if fields.size() != CHANNELS:
-        raise Malformed(f"frames without exactly {CHANNELS} channels")
-    flags = fields.array("<u4", count)
-    planes = fields.array("<i2", count * whiskers * CHANNELS).reshape(whiskers * CHANNELS, count)
-    fields.end()
-    if (flags > 255).any():
-        raise Malformed(f"frame flags {int(flags.max())} where 255 is the largest possible")
-    values = np.cumsum(planes, axis=1, dtype=np.int16).T.reshape(count, whiskers, CHANNELS)
-    return time, Frames(
-        np.cumsum(sequence, dtype=np.int64),
-        np.cumsum(device, dtype=np.int64),
-        flags.astype(np.uint8),
-        np.ascontiguousarray(values),
-    )
-
-
-def encode_states(states: np.ndarray) -> bytes:
-    """Encode arm states [N], N > 0 (`robot.drivers.ur10.shared_state.ARM_STATE`)."""
-    count = len(states)
-    numbers = np.concatenate([states[name].reshape(count, -1) for name in NUMBERS], axis=1)
-    words = np.stack([states[name].astype("<i4") for name in WORDS])
-    parts = [
-        struct.pack("<4sd2I", CDR, states["host"][-1], count, count),
-        states["counter"].astype("<i8").tobytes(),
-        struct.pack("<2I", numbers.shape[1], numbers.size),
-        np.ascontiguousarray(numbers.T, "<f8").tobytes(),
-        struct.pack("<2I", len(words), words.size),
-        words.tobytes(),
-    ]
-    return b"".join(parts)
-
-
-def decode_states(message: bytes) -> tuple[float, np.ndarray]:
-    """Decode (time, states [N]); raises `Malformed`."""
-    fields = _Fields(message)
-    time = fields.number("<d")
-    count = fields.size()
-    counter = fields.array("<i8", count)
-    rows = fields.size()
-    numbers = fields.array("<f8", rows * count).reshape(rows, count)
-    width = fields.size()
-    words = fields.array("<i4", width * count).reshape(width, count)
-    fields.end()
-    if width != len(WORDS) or rows != sum(ARM_STATE[name].itemsize // 8 for name in NUMBERS):
-        raise Malformed(f"arm states of {rows} numbers and {width} words")
-    states = np.zeros(count, ARM_STATE)
-    states["counter"] = counter
-    row = 0
-    for name in NUMBERS:
-        wide = ARM_STATE[name].itemsize // 8
-        states[name] = numbers[row : row + wide].T.reshape(states[name].shape)
-        row += wide
-    for name, word in zip(WORDS, words, strict=True):
-        states[name] = word.astype(ARM_STATE[name])
-    return time, states
-
-
-_CUT = struct.Struct("<4s6d3qI?")
-
-
-def encode_cut(cut: Cut) -> bytes:
-    """Encode a cut."""
-    return _CUT.pack(
-        CDR, cut.time, *cut.odometry, cut.start, cut.number, cut.first, cut.last, cut.frames, cut.seen
-    )
-
-
-def decode_cut(message: bytes) -> Cut:
-    """Decode a cut; raises `Malformed`."""
-    if len(message) != _CUT.size or not message.startswith(CDR):
-        raise Malformed("malformed Cut message")
-    _, time, *motion, start, number, first, last, frames, seen = _CUT.unpack(message)
-    odometry = Odometry(*(np.float64(value) for value in motion))
-    return Cut(number, time, start, first, last, frames, odometry, seen)
-
-
-def encode_event(event: Event) -> bytes:
-    """Encode an event."""
-    if ": " in event.name:
-        raise ValueError(f"a colon in the event name {event.name!r}")
-    text = f"{event.name}: {event.text}".encode() + b"\0"
-    return struct.pack("<4sdI", CDR, event.time, len(text)) + text
-
-
-def decode_event(message: bytes) -> Event:
-    """Decode an event; raises `Malformed`."""
-    fields = _Fields(message)
-    time = fields.number("<d")
-    text = fields.array("u1", None).tobytes()
-    fields.end()
-    name, colon, found = text[:-1].decode().partition(": ")
-    if not (colon and text.endswith(b"\0")):
-        raise Malformed("an event without a name")
-    return Event(time, name, found)
-
-
-def _encode_steps(value: np.ndarray, kind: str) -> bytes:
+def _steps(value: np.ndarray) -> np.ndarray:
     """The first value along the last axis, then differences; both wrap around."""
-    return np.diff(value, axis=-1, prepend=value.dtype.type(0)).astype(kind).tobytes()
-
-
-class _Fields:
-    """Reads the fields of a message in order."""
-
-    def __init__(self, message: bytes) -> None:
-        if not message.startswith(CDR):
-            raise Malformed("a message with another encoding than little-endian CDR")
-        self._message, self._place = message, len(CDR)
-
-    def number(self, kind: str) -> float:
-        """Read one number."""
-        return float(self._take(kind, 1)[0])
-
-    def size(self) -> int:
-        """Read a uint32."""
-        return int(self._take("<u4", 1)[0])
-
-    def array(self, kind: str, count: int | None) -> np.ndarray:
-        """Read an array, which must have `count` numbers if that is given."""
-        found = self.size()
-        if count is not None and found != count:
-            raise Malformed(f"an array of {found} numbers where {count} were expected")
-        return self._take(kind, found)
-
-    def end(self) -> None:
-        """Require the end of the message."""
-        if self._place != len(self._message):
-            raise Malformed(f"{len(self._message) - self._place} bytes after the end of the message")
-
-    def _take(self, kind: str, count: int) -> np.ndarray:
-        size = np.dtype(kind).itemsize * count
-        if count > MAX_NUMBERS or self._place + size > len(self._message):
-            raise Malformed("a message that ends too early")
-        found = np.frombuffer(self._message, kind, count, self._place)
-        self._place += size
-        return found
+    return np.diff(value, axis=-1, prepend=value.dtype.type(0))

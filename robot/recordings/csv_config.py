@@ -122,14 +122,20 @@ class MotionColumns(Settings):
     """Column of the turn, rad, counter-clockwise."""
 
 
-class ViewColumns(Settings):
-    """Views of rows x columns pixels from numbered columns (r0, r1, ...)."""
+class _OtherFile(Settings):
+    """Columns that may stand in another file."""
 
     file: Path | None = None
-    """File of the views; a `*` in its name stands for the beginning of the recording's file name. Null: the
-    odometry file, with empty cells in rows without a view."""
+    """File of these columns; a `*` in its name stands for the beginning of the recording's file name. Null:
+    the odometry file."""
     time: str = "t"
     """Column of the time, s, in that file."""
+
+
+class ViewColumns(_OtherFile):
+    """Views of rows x columns pixels from numbered columns (r0, r1, ...); in the odometry file with empty
+    cells in rows without a view."""
+
     prefix: str = "r"
     """Name of the columns before the number."""
     max_range: float | None = Field(default=None, gt=0)
@@ -141,14 +147,9 @@ class ViewColumns(Settings):
     """Unit of the ranges; null: that of the header, else m."""
 
 
-class ContactColumns(Settings):
+class ContactColumns(_OtherFile):
     """Contacts of touch sensors around the robot, such as bumpers: a column each, 1 in contact, else 0."""
 
-    file: Path | None = None
-    """File of the contacts; a `*` in its name stands for the beginning of the recording's file name. Null:
-    the odometry file."""
-    time: str = "t"
-    """Column of the time, s, in that file."""
     directions: Annotated[dict[str, Degrees], Field(min_length=1)] = Field(
         default={"left": 45.0, "front": 0.0, "right": -45.0}
     )
@@ -159,13 +160,9 @@ class ContactColumns(Settings):
     """As for views."""
 
 
-class LabelColumns(Settings):
+class LabelColumns(_OtherFile):
     """Place labels given with the recording."""
 
-    file: Path | None = None
-    """File of the labels; null: the odometry file."""
-    time: str = "t"
-    """Column of the time, s, in that file."""
     column: str = "label"
     """Column of the labels, integers from 0; empty or -1 for none."""
     tolerance: float | None = Field(default=None, ge=0)
@@ -190,13 +187,9 @@ class PairColumns(Settings):
     """As for views."""
 
 
-class TruthColumns(PoseColumns):
+class TruthColumns(_OtherFile, PoseColumns):
     """True poses, interpolated to the odometry rows; none outside their time span."""
 
-    file: Path | None = None
-    """File of the true poses; null: the odometry file."""
-    time: str = "t"
-    """Column of the time, s, in that file."""
     units: TableUnits = TableUnits()
     """Units of the true poses, and of the time in their file."""
 

@@ -51,7 +51,6 @@ class CsvDescription(NamedTuple):
         max_range: of the views, m; NaN without ranges. missing: what it lacks, in words.
     """
 
-    path: Path
     rows: int
     time: np.ndarray | None
     columns: tuple[tuple[str, float, float], ...]
@@ -73,7 +72,7 @@ def describe_csv(path: Path) -> CsvDescription:
     if time is None or not np.isfinite(file.column(time)).any():
         faults = file.judge([time])[1] if time is not None else []
         missing.append(str(faults[0]) if faults else "a column of times (t, time, stamp)")
-        return CsvDescription(path, len(file.values), None, _columns(file), {}, {}, np.nan, tuple(missing))
+        return CsvDescription(len(file.values), None, _columns(file), {}, {}, np.nan, tuple(missing))
     odometry = _odometry(file)
     units = _units(file, time, odometry or {})
     file = replace(file, clock=units.get("time"))
@@ -92,14 +91,12 @@ def describe_csv(path: Path) -> CsvDescription:
         views, ranges = _views(file, other)
         if views is not None and "views" not in table:
             table |= views
-            parts["views"] = _words({"views": views["views"]})
             max_range = ranges
-        for name, part in _truth_and_labels(file, other).items():
-            if name not in table:
-                table[name] = part
-                parts[name] = _words({name: part})
+        table |= {name: part for name, part in _truth_and_labels(file, other).items() if name not in table}
     if "pairs" in table and "labels" in table:
-        del table["pairs"], parts["pairs"]
+        del table["pairs"]
+    beside = ("views", "truth", "labels", "pairs")
+    parts |= {name: _words({name: part}) for name, part in table.items() if name in beside}
     if not {"views", "labels", "pairs"} & table.keys():
         missing.append("views: numbered columns (r0, r1, ...), here or in a file whose name begins alike")
     if "truth" not in table:
@@ -110,9 +107,8 @@ def describe_csv(path: Path) -> CsvDescription:
         parts["rate"] = f"rounded times: rows share each, so they are counted instead, {rate:.6g} a second"
         moments = moments[0] + np.arange(len(moments)) / rate
     moments, found = moments[np.isfinite(moments)], table if odometry else {}
-    return CsvDescription(
-        path, len(file.values), moments, _columns(file), parts, found, max_range, tuple(missing)
-    )
+    columns = _columns(file)
+    return CsvDescription(len(file.values), moments, columns, parts, found, max_range, tuple(missing))
 
 
 def _companions(file: CsvFile, time: str) -> list[CsvFile]:
@@ -208,14 +204,12 @@ def _odometry(file: CsvFile) -> dict[str, Any] | None:
         poses.pop("", None)
     if poses:
         return {"pose": next(iter(poses.values()))}
-    forward, turn = _named(file, _FORWARD_SPEEDS), _named(file, _TURN_RATES)
-    if forward is not None and turn is not None:
-        left = _named(file, _LEFT_SPEEDS)
-        return {"velocity": {"forward": forward, "turn": turn} | ({"left": left} if left else {})}
-    forward, turn = _named(file, DISTANCES), _named(file, TURNS)
-    return (
-        {"motion": {"forward": forward, "turn": turn}} if forward is not None and turn is not None else None
-    )
+    steps = {"velocity": (_FORWARD_SPEEDS, _TURN_RATES, _LEFT_SPEEDS), "motion": (DISTANCES, TURNS, ())}
+    for kind, names in steps.items():
+        forward, turn, left = (_named(file, each) for each in names)
+        if forward is not None and turn is not None:
+            return {kind: {"forward": forward, "turn": turn} | ({"left": left} if left else {})}
+    return None
 
 
 def _truth_and_labels(file: CsvFile, other: CsvFile) -> dict[str, dict[str, Any]]:
@@ -275,10 +269,12 @@ def _columns(file: CsvFile) -> tuple[tuple[str, float, float], ...]:
                 found[joined] = file.block(prefix)[0]
         else:
             found[name] = file.values[:, place]
-    known = {name: values[np.isfinite(values)] for name, values in found.items()}
-    nothing = np.array([np.nan])
-    known = {name: values if len(values) else nothing for name, values in known.items()}
-    return tuple((name, float(values.min()), float(values.max())) for name, values in known.items())
+    columns = []
+    for name, values in found.items():
+        known = values[np.isfinite(values)]
+        low, high = (known.min(), known.max()) if len(known) else (np.nan, np.nan)
+        columns.append((name, float(low), float(high)))
+    return tuple(columns)
 
 
 def _words(settings: dict[str, Any]) -> str:

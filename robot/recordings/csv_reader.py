@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from robot.recordings import csv_config as columns
 from robot.recordings.alignment import (
-    RecordingRows,
+    blank_rows,
     interpolated_poses,
+    judged,
     nearest_rows,
     range_errors,
     range_pixels,
@@ -33,7 +34,7 @@ from robot.recordings.sanity_checks import (
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors
 from robot.sources.odometry import from_motions, from_poses, from_velocities
-from robot.sources.source import PlanarWhiskersInfo, Warn
+from robot.sources.source import PlanarWhiskersInfo, SourceInfo, Warn
 from tactile.base.errors import InputError
 from tactile.base.settings import Settings
 
@@ -76,7 +77,7 @@ def read_csv_recording(
     paths = [path, *(part.file for part in parts if part is not None and part.file is not None)]
     found = {name: read_csv(name, config.units.time) for name in dict.fromkeys(paths)}
     raise_errors(_absences(found[path], found, config))
-    digest, limits, warn = digest_of(file.content for file in found.values()), judge.limits, judge.warn
+    digest, warn = digest_of(file.content for file in found.values()), judge.warn
     if judge.stretch != WHOLE:
         found = _within(found, path, config, judge.stretch)
 
@@ -95,12 +96,10 @@ def read_csv_recording(
         there = config.time in (*base.names, *base.full)
         start = base.column(config.time, "time", config.units.time)[0] if there else 0.0
         time = np.nan_to_num(start) + kept / config.rate
-    motion, poses, faults = _motion(base, time, kept, config, limits)
-    recording = RecordingRows(
-        str(path), time, motion, (config.rows, config.columns, 1), 0, errors + faults, poses=poses
-    )
-    recording.place, recording.held = base.place, isinstance(part, columns.VelocityColumns)
-    recording.cures = lambda quantity, unit: f"--set recording.table.units.{quantity}={unit}"
+    motion, poses, faults = _motion(base, time, kept, config, judge.limits)
+    shape, held = (config.rows, config.columns, 1), isinstance(part, columns.VelocityColumns)
+    errors += faults
+    source = blank_rows(path, time, motion, shape)
     # What belongs to a row that is left out, is left out too.
     every, rows = time, np.arange(len(whole.lines))
     if len(kept) < len(rows):  # the times of rows that are left out lie between those of their neighbours
@@ -114,30 +113,33 @@ def read_csv_recording(
     def placed(file: Path | None, aligned: AlignedRows) -> tuple[np.ndarray, np.ndarray]:
         """The values without errors whose row is kept, and its number."""
         rows, values, faults = aligned
-        recording.errors += faults
+        errors.extend(faults)
         if faults:
             return np.zeros(0, int), values[:0]
         rows = rows if files.of(file) is base else row_of[rows]
         return rows[rows >= 0], values[rows >= 0]
 
     if config.views is not None:
-        rows, values = placed(config.views.file, _views(files, config.views, recording.shape))
-        recording.views[rows], recording.seen[rows] = values.reshape(-1, *recording.shape), True
-    if (touch := config.contacts) is not None:
-        rows, values = placed(touch.file, _contacts(files, touch))
-        mounts = tuple((0.0, 0.0, direction) for direction in touch.directions.values())
-        recording.set_contacts(rows, values, PlanarWhiskersInfo(mounts=mounts, length=touch.distance))
+        rows, values = placed(config.views.file, _views(files, config.views, shape))
+        source["views"][rows], source["seen"][rows] = values.reshape(-1, *shape), True
+    if config.contacts is not None:
+        rows, values = placed(config.contacts.file, _contacts(files, config.contacts))
+        source |= _touch(config.contacts, rows, values, len(time))
     if config.pairs is not None:
-        rows, recording.label[rows] = placed(config.pairs.file, _pairs(files, config.pairs))
+        rows, source["label"][rows] = placed(config.pairs.file, _pairs(files, config.pairs))
     elif config.labels is not None:
-        rows, recording.label[rows] = placed(config.labels.file, _labels(files, config.labels))
+        rows, source["label"][rows] = placed(config.labels.file, _labels(files, config.labels))
     if config.truth is not None:
         file = files.of(config.truth.file)
         same, clock = file is base, time if file is base else files.time
-        truth, faults = align_truth(file, config.truth, clock, limits, same, warn)
-        recording.truth = truth if same else truth[kept]
-        recording.errors += faults
-    return recording.source(path.stem, digest, judge)
+        truth, faults = align_truth(file, config.truth, clock, judge, same)
+        source["truth"] = truth if same else truth[kept]
+        errors.extend(faults)
+    ids_alone = bool((source["label"] >= 0).any()) and not source["seen"].any()
+    info = SourceInfo(labels_only=ids_alone, planar_whiskers=source.pop("sensors", None))
+    cures = "--set recording.table.units.{}={}".format
+    found_all = InMemorySource(digest=digest, info=info, **source)
+    return judged(found_all, errors, judge, str(path), base.place, held, poses, cures)
 
 
 def _within(
@@ -312,6 +314,21 @@ def _contacts(files: _Files, part: columns.ContactColumns) -> AlignedRows:
     return rows, values == 1, errors + faults
 
 
+def _touch(
+    part: columns.ContactColumns, rows: np.ndarray, touching: np.ndarray, count: int
+) -> dict[str, Any]:
+    """Contacts [M, W] at M of so many rows, and none at the others, as arguments of `InMemorySource`; the
+    sensors that make them."""
+    contact = np.zeros((count, len(part.directions)), bool)
+    contact[rows] = touching
+    angle = np.radians(list(part.directions.values()))
+    tips = part.distance * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    mounts = tuple((0.0, 0.0, direction) for direction in part.directions.values())
+    sensors = PlanarWhiskersInfo(mounts=mounts, length=part.distance)
+    point, alive = tips * contact[:, :, None], np.ones(len(angle), bool)
+    return {"contact": contact, "point": point, "alive": alive, "sensors": sensors}
+
+
 def _labels(files: _Files, labels: columns.LabelColumns) -> AlignedRows:
     """Place labels [M] int32 as given."""
     file = files.of(labels.file)
@@ -326,7 +343,11 @@ def _labels(files: _Files, labels: columns.LabelColumns) -> AlignedRows:
 
 
 def _pairs(files: _Files, part: columns.PairColumns) -> AlignedRows:
-    """Place labels [V] int32 derived from pairs."""
+    """Place labels [V] int32 from pairs of times that a place recogniser matched, in order of appearance.
+
+    Every time is a view; its best earlier match passes on its label, without one the view is a new place. Of
+    matches with equal scores the first is used.
+    """
     file = files.of(part.file)
     later, earlier = (file.column(name, "time") for name in (part.later, part.earlier))
     score = file.column(part.score)
@@ -337,49 +358,23 @@ def _pairs(files: _Files, part: columns.PairColumns) -> AlignedRows:
     errors += first_error(crossed, file.place, found, "the later time of a pair first", cure)
     if errors:
         return later, later, errors
-    moments, ids = labels_from_pairs(later.tolist(), earlier.tolist(), score.tolist(), part.threshold)
-    rows, errors = each_nearest(
-        moments, files.time, part.tolerance, lambda i: f"{file.path}, time {moments[i]}"
-    )
-    return rows, ids, errors
-
-
-def labels_from_pairs(
-    later: Sequence[float], earlier: Sequence[float], score: Sequence[float], threshold: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Place labels from pairs of times that a place recogniser matched.
-
-    Every time is a view; its best earlier match passes on its label, without one the view is a new place.
-
-    Args:
-        later, earlier: s, the two times of each pair. score: similarity of each pair.
-        threshold: smallest score of a match. Of equal scores the first pair is used.
-
-    Returns:
-        time: [V] s, increasing. label: [V] int32, places numbered in order of appearance.
-    """
     best: dict[float, tuple[float, float]] = {}
-    for time, match, value in zip(later, earlier, score, strict=True):
-        if value >= threshold and (time not in best or value > best[time][0]):
+    for time, match, value in zip(later.tolist(), earlier.tolist(), score.tolist(), strict=True):
+        if value >= part.threshold and (time not in best or value > best[time][0]):
             best[time] = value, match
-    moments = np.unique(np.concatenate([later, earlier]))
-    ids: dict[float, int] = {}
-    places = 0
+    moments, ids, places = np.unique(np.concatenate([later, earlier])), dict[float, int](), 0
     for moment in moments.tolist():
         if moment in best:
             ids[moment] = ids[best[moment][1]]
         else:
             ids[moment], places = places, places + 1
-    return moments, np.fromiter(ids.values(), np.int32, len(ids))
+    place = lambda row: f"{file.path}, time {moments[row]}"  # noqa: E731
+    rows, errors = each_nearest(moments, files.time, part.tolerance, place)
+    return rows, np.fromiter(ids.values(), np.int32, len(ids)), errors
 
 
 def align_truth(
-    file: CsvFile,
-    part: columns.TruthColumns,
-    time: np.ndarray,
-    limits: UnitLimits,
-    same_rows: bool,
-    warn: Warn = None,
+    file: CsvFile, part: columns.TruthColumns, time: np.ndarray, judge: InputJudge, same_rows: bool
 ) -> tuple[np.ndarray, list[InputError]]:
     """True poses [N, 3] at times [N] s, NaN outside the time span of the truth.
 
@@ -388,13 +383,13 @@ def align_truth(
     """
     names = [name for name, _ in column_keys(part, "")[same_rows:]]
     clock = "" if same_rows else part.time
-    good, errors = _sound_rows(file, names, "true poses", warn, clock, part.quaternion or ())
+    good, errors = _sound_rows(file, names, "true poses", judge.warn, clock, part.quaternion or ())
     unknown = np.full((len(time), 3), np.nan)
     if errors:
         return unknown, errors
     file = file.rows(good)
     moments = time[good] if same_rows else file.column(part.time, "time", part.units.time)
-    truth, errors = _read_poses(file, part, part.units, moments, limits, "table.truth")
+    truth, errors = _read_poses(file, part, part.units, moments, judge.limits, "table.truth")
     if same_rows:
         unknown[good] = truth
         return unknown, errors
@@ -491,10 +486,9 @@ def each_nearest(
         moments: [M] s, increasing. time: [N] s, of the odometry rows. tolerance: s; None: the median step.
         place: names a row of `moments` in errors.
     """
-    found = nearest_rows(moments, time, tolerance)
-    if found is None:
+    if not (np.diff(time) > 0).all():
         return np.zeros(len(moments), int), []  # the error of the clock is already reported
-    rows, away, reach = found
+    rows, away, reach = nearest_rows(moments, time, tolerance)
     far, cure = away > reach, "raise tolerance, or bring both to one clock"
     one = f"(one of {int(far.sum())} such rows)"
     found_far = lambda i: f"the nearest odometry row is {away[i]:.4g} s away {one}"  # noqa: E731

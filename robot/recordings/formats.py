@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from robot.recordings.bags.topics_config import TopicsConfig
 from robot.recordings.input_judge import InputJudge
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import Stretch
@@ -37,13 +36,12 @@ def _open(config: RecordingConfig, judge: InputJudge) -> Source:
     """The recording as it is. Readers are imported when they are needed: some are slow to load."""
     file, suffix = config.file, config.file.suffix.lower()
     if suffix == ".mcap":
-        from robot.recordings.mcap_scanner import is_foreign
+        from robot.recordings.mcap_reader import is_foreign
     whole = config.topics is not None or (file / "metadata.yaml").is_file()
     if whole or suffix in BAGS or (suffix == ".mcap" and is_foreign(file)):
         from robot.recordings.bags.bag_reader import read_bag
 
-        topics, motion = config.topics or TopicsConfig(), config.visual_odometry
-        return read_bag(file, topics, judge, image=config.image, visual_odometry=motion)
+        return read_bag(config, judge)
     if suffix == ".mcap":
         from robot.recordings.mcap_reader import Recording
 

@@ -29,12 +29,7 @@ from pydantic import Field
 
 from robot.recordings.csv_config import PER_UNIT, WORDS
 from robot.recordings.sanity_checks import WHOLE, RowName, Stretch, count_others
-from robot.sources.odometry import (
-    UNCORRECTED,
-    OdometryCorrection,
-    correct_motions,
-    replace_steps,
-)
+from robot.sources.odometry import UNCORRECTED, OdometryCorrection, correct_motions, replace_steps
 from robot.sources.source import Warn
 from tactile.base.errors import InputError
 from tactile.base.settings import Settings

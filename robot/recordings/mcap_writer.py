@@ -1,4 +1,5 @@
-"""Writes recordings as MCAP files that stay readable when the process is killed or the disk is full.
+"""Writes recordings as MCAP files that stay readable when the process is killed or the disk is full; copies
+sources to recordings, and recovers truncated ones.
 
 Chunks are zstd-compressed, have checksums, and reach the operating system as a whole.
 """
@@ -7,18 +8,20 @@ from __future__ import annotations
 
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, cast
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from robot.recordings.cdr import READINGS, SCHEMAS, TOPICS, TRUTH, encode, encode_truth
-from robot.recordings.mcap_scanner import METADATA, RecordingDescription
-from robot.sources.source import Sample, SourceInfo
+from robot.drivers.head.decoder import Cut, Frames
+from robot.recordings.cdr import READINGS, SCHEMAS, TOPICS, TRUTH, Event, encode, encode_truth
+from robot.recordings.mcap_reader import METADATA, McapScanner, metadata_of, read_metadata
+from robot.sources.input_files import require_file
+from robot.sources.source import Sample, Source, SourceDescription
 from tactile.base.errors import InputError
-from tactile.base.files import require_new_file
+from tactile.base.files import flush_to_disk, make_new_file, require_new_file
 
 _CHUNK_BYTES = 1 << 16
 """Size of a chunk before compression."""
@@ -32,13 +35,13 @@ class RecordingWriteError(InputError):
         super().__init__(str(path), f"cannot be written any further ({error.strerror or error})", "", cure)
 
 
-class McapWriter:
-    """Appends messages to a new file.
+class Recorder:
+    """Writes a new file; a context manager.
 
     Args:
         path: must not exist yet.
-        view_shape, whiskers: of every sample. rate_hz: nominal rate, 0 if unknown; for information.
-        info: devices, world and origin; stored at the start of the file, so that a truncated one has it.
+        source: has the view shape and number of whiskers of every sample, a nominal rate, and devices, world
+            and origin; stored at the start of the file, so that a truncated one has them.
         chunk_s: a chunk is written when it has `_CHUNK_BYTES`, or when the time of its last message differs
             from that of the previous chunk by this many seconds.
 
@@ -47,23 +50,13 @@ class McapWriter:
 
     Raises:
         InputError: the file exists or cannot be created.
-        ValueError, TypeError: provenance in `info` is not JSON.
+        ValueError, TypeError: provenance of the source is not JSON.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        view_shape: tuple[int, int, int],
-        whiskers: int,
-        rate_hz: float,
-        info: SourceInfo,
-        chunk_s: float = 0.5,
-    ) -> None:
-        self.description = RecordingDescription(view_shape, whiskers, rate_hz, _program(), info)
-        metadata = self.description.to_metadata()
-        RecordingDescription.from_metadata(metadata)
-        self.path = path
+    def __init__(self, path: Path, source: Source | SourceDescription, chunk_s: float = 0.5) -> None:
+        metadata = metadata_of(source, _program())
+        read_metadata(metadata)
+        self.path, self._sizes = path, (source.view_shape, source.whiskers)
         try:
             self._file = WholeChunkFile(path)
         except FileExistsError:
@@ -84,8 +77,32 @@ class McapWriter:
         self._writer.add_metadata(METADATA, metadata)
         self.flush()
 
+    def write(
+        self,
+        content: Sample | Cut | Frames | np.ndarray | Event,
+        truth: np.ndarray | None = None,
+        arrival: float = np.nan,
+    ) -> None:
+        """Append a sample with its truth, or what a live session records (see `encode`).
+
+        Args:
+            truth: [3] of a cut. arrival: of frames, when the newest of them came, s.
+
+        Raises:
+            InputError: a shape, dtype or time that the recording cannot hold (nothing is written then), or
+                the disk is full.
+        """
+        if isinstance(content, Sample):
+            truth = content.truth
+            if not np.isfinite(content.time):
+                raise InputError("time", f"{content.time}", "a finite number of seconds")
+        name, time, message = encode(content, *self._sizes, arrival)
+        if truth is not None:  # written first, so that no truncated file has a reading without it
+            self.append(TRUTH, time, encode_truth(time, truth))
+        self.append(name, time, message)
+
     def append(self, name: str, time: float, message: bytes) -> None:
-        """Append a message with that schema; the truth of a reading precedes it.
+        """Append an encoded message with that schema; the truth of a reading precedes it.
 
         Raises:
             RecordingWriteError: the operating system refuses to write.
@@ -135,6 +152,12 @@ class McapWriter:
         finally:
             self._file.close()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
 
 class WholeChunkFile:
     """A new file; `flush` writes all pending bytes or none."""
@@ -179,59 +202,43 @@ def _program() -> str:
         return "ratslam"
 
 
-class Recorder:
-    """Writes samples to a new file; a context manager.
+def record_source(source: Source, path: Path) -> int:
+    """Write all samples of a source to a new recording; returns their number."""
+    with Recorder(path, source) as recorder:
+        for sample in source:
+            recorder.write(sample)
+        return recorder.count
 
-    Args: see `McapWriter`.
+
+def recover(path: Path, out: Path) -> tuple[int, str]:
+    """Copy every readable message of a truncated or damaged recording, unchanged, to a new, complete one.
+
+    The new file appears under its name only when it is complete. Values are not checked.
+
+    Returns:
+        the number of samples, and the fault of the old file, '' if it was complete.
 
     Raises:
-        InputError: the file exists or cannot be created.
-        ValueError, TypeError: provenance in `info` is not JSON.
+        InputError: `path` has no readable sample, or `out` exists.
     """
+    require_file(path)
+    require_new_file(out)
+    scanner = McapScanner(path)
+    entries = scanner.entries()
+    first = next(entries, None)
+    if first is None or scanner.description is None:
+        raise scanner.unreadable_error()
+    described = scanner.description
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        view_shape: tuple[int, int, int] = (3, 6, 1),
-        whiskers: int = 0,
-        rate_hz: float = 0.0,
-        info: SourceInfo | None = None,
-        chunk_s: float = 0.5,
-    ) -> None:
-        info = info or SourceInfo()
-        self._writer = McapWriter(
-            path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, info=info, chunk_s=chunk_s
-        )
+    def write(path: Path) -> None:
+        with Recorder(path, described) as recorder:
+            for entry in chain([first], entries):
+                if entry.truth is not None:
+                    recorder.append(TRUTH, entry.time, entry.truth)
+                recorder.append(entry.name, entry.time, entry.message)
+        if not scanner.count:
+            raise scanner.unreadable_error()
+        flush_to_disk(path)
 
-    @property
-    def count(self) -> int:
-        """Number of samples so far."""
-        return self._writer.count
-
-    def write(self, sample: Sample) -> None:
-        """Append a sample.
-
-        Raises:
-            InputError: a shape, dtype or time that the recording cannot hold (nothing is written then), or
-                the disk is full.
-        """
-        if not np.isfinite(sample.time):
-            raise InputError("time", f"{sample.time}", "a finite number of seconds")
-        described = self._writer.description
-        name, message = encode(sample, described.view_shape, described.whiskers)
-        if sample.truth is not None:  # written first, so that no truncated file has a reading without it
-            self._writer.append(TRUTH, sample.time, encode_truth(sample.time, sample.truth))
-        self._writer.append(name, sample.time, message)
-
-    def close(self) -> None:
-        """Finish the file; may be called again."""
-        self._writer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    make_new_file(out, write)
+    return scanner.count, scanner.broken

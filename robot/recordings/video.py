@@ -17,13 +17,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from robot.recordings.csv_file import CsvFile
-from robot.recordings.sanity_checks import clock_errors
 from robot.sources.input_files import require_file
 from robot.sources.odometry import from_motions
 from robot.sources.source import Warn
@@ -179,15 +178,8 @@ def _vertex(errors: np.ndarray, best: int) -> float:
     return (left - right) / (2 * rise) if rise > 0 else 0.0
 
 
-class Frame(NamedTuple):
-    """One image.
-
-    Attributes:
-        time: s, on the clock of the recording. grey: [H, W] uint8.
-    """
-
-    time: float
-    grey: np.ndarray
+Frame = tuple[float, np.ndarray]
+"""The time of an image, s, on the clock of the recording, and the image in grey, [H, W] uint8."""
 
 
 def camera_rows(
@@ -210,23 +202,25 @@ def camera_rows(
     time, pictures, moves = list[float](), list[np.ndarray](), list[tuple[float, float]]()
     size: tuple[int, ...] | None = None
     before: tuple[Profile, Profile] | None = None
-    for number, frame in enumerate(frames):
+    for number, (moment, grey) in enumerate(frames):
         place = f"{where}, frame {number}"
-        size = size or frame.grey.shape
-        if frame.grey.shape != size:
-            found = f"{frame.grey.shape[1]} x {frame.grey.shape[0]} pixels"
+        size = size or grey.shape
+        if grey.shape != size:
+            found = f"{grey.shape[1]} x {grey.shape[0]} pixels"
             raise InputError(place, found, f"{size[1]} x {size[0]}, as in frame 0")
-        pictures.append(image_view(views, frame.grey, place))
+        pictures.append(image_view(views, grey, place))
         if odometry is not None:
-            turning = _profile(odometry, "rotation", frame.grey, place)
-            after = turning, _profile(odometry, "translation", frame.grey, place)
+            after = (
+                _profile(odometry, "rotation", grey, place),
+                _profile(odometry, "translation", grey, place),
+            )
             pixel_angle = float(np.deg2rad(odometry.fov_deg)) / size[1]
             step = 0.0, 0.0
             if before is not None:
-                step = _motion_between(odometry, before, after, pixel_angle, frame.time - time[-1])
+                step = _motion_between(odometry, before, after, pixel_angle, moment - time[-1])
             moves.append(step)
             before = after
-        time.append(frame.time)
+        time.append(moment)
     if not time:
         raise InputError(where, "no frames", "at least one image")
     clock = np.array(time)
@@ -270,19 +264,13 @@ def describe_video(path: Path) -> tuple[int, float, int, int]:
     return int(frames), rate, int(width), int(height)
 
 
-def stamp_errors(file: CsvFile, column: str) -> list[InputError]:
-    """Errors of a file of stamps: no such column, numbers that are not finite, times that do not increase."""
-    errors = file.absences([(column, "video.time")])
-    return errors or file.judge([column])[1] + clock_errors(file.column(column, "time"), column, file.place)
-
-
 def video_frames(
     path: Path, config: VideoConfig, stamps: CsvFile | None, warn: Warn = None
 ) -> Iterator[Frame]:
     """The frames of a video, decoded one by one. Colours become grey as in JPEG, 0.299 R + 0.587 G + 0.114 B.
 
     Args:
-        stamps: the file `config.stamps`, checked by `stamp_errors`; None: times follow from `config.rate`.
+        stamps: the file `config.stamps`, whose times increase; None: times follow from `config.rate`.
         warn: called with one sentence if the file ends before the frames that it announces.
 
     Raises:
@@ -299,7 +287,7 @@ def video_frames(
                 if not good:
                     cure = "was the file copied completely?"
                     raise InputError(f"{path}, frame {count}", "cannot be decoded", "an image", cure)
-                yield Frame(time, np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)))
+                yield time, np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
             count += 1
     if warn is not None and count < announced:
         warn(f"{path}: only {count} of {announced} frames can be read")
@@ -313,7 +301,13 @@ def video_frames(
 def _opened(path: Path) -> Iterator[tuple[ModuleType, Any]]:
     """OpenCV, and the opened video."""
     require_file(path)
-    cv2 = _opencv()
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # or it prints its own errors beside ours
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    try:
+        import cv2
+    except ModuleNotFoundError:
+        found = "opencv is not installed"
+        raise InputError("video", found, "", "pip install 'ratslam[video]'") from None
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         if not video.isOpened():
@@ -333,14 +327,3 @@ def _times(path: Path, config: VideoConfig, stamps: CsvFile | None, announced: f
         raise InputError(str(path), "no times of its frames", "a frame rate, or a file of stamps", cure)
     rate = config.rate
     return (number / rate for number in itertools.count())
-
-
-def _opencv() -> ModuleType:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # or it prints its own errors beside ours
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
-    try:
-        import cv2
-    except ModuleNotFoundError:
-        found = "opencv is not installed"
-        raise InputError("video", found, "", "pip install 'ratslam[video]'") from None
-    return cv2

@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from robot.recordings.alignment import judged
 from robot.recordings.csv_file import read_csv
 from robot.recordings.csv_reader import ODOMETRY, align_truth, column_keys, each_nearest, read_csv_recording
-from robot.recordings.input_judge import InputJudge, MotionTrack
+from robot.recordings.input_judge import InputJudge
 from robot.recordings.recording_config import RecordingConfig
-from robot.recordings.video import VideoConfig, camera_rows, stamp_errors, video_frames
+from robot.recordings.sanity_checks import clock_errors
+from robot.recordings.video import VideoConfig, camera_rows, video_frames
 from robot.sources.in_memory import InMemorySource
-from robot.sources.input_files import digest_of, digest_of_files, raise_errors, require_file
+from robot.sources.input_files import digest_of, raise_errors, require_file
 from tactile.base.errors import InputError
 
 
@@ -31,12 +33,14 @@ def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
         wheels = read_csv_recording(video.odometry, config.table, judge)
     stamps = read_csv(video.stamps) if video.stamps is not None else None
     if stamps is not None:
-        raise_errors(stamp_errors(stamps, video.time))
+        raise_errors(stamps.absences([(video.time, "video.time")]))
+        moments = stamps.column(video.time, "time")
+        raise_errors(stamps.judge([video.time])[1] + clock_errors(moments, video.time, stamps.place))
     visual = config.visual_odometry if wheels is None else None
     time, view, motion = camera_rows(
         video_frames(path, video, stamps, judge.warn), config.image, visual, str(path)
     )
-    digest = digest_of_files([path], b"" if stamps is None else stamps.content)
+    digest = digest_of([path, b"" if stamps is None else stamps.content])
     inside = judge.stretch.rows(time, str(path))
     time, view = time[inside], view[inside]
     if wheels is not None:
@@ -49,25 +53,22 @@ def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
     if config.table.truth is not None and config.table.truth.file is not None:
         file = read_csv(config.table.truth.file, config.table.units.time)
         raise_errors(file.absences(column_keys(config.table.truth, "table.truth")))
-        truth, errors = align_truth(
-            file, config.table.truth, time, config.limits, same_rows=False, warn=judge.warn
-        )
+        truth, errors = align_truth(file, config.table.truth, time, judge, same_rows=False)
         raise_errors(errors)
     everywhere = np.ones(len(time), bool)
-    # Visual odometry has no scale, so its lengths cannot be compared with those of the truth.
-    track = MotionTrack(time, everywhere, motion)
-    raise_errors(judge.errors(track, lambda row: f"{path}, frame {row * video.every}", str(path)))
-    return InMemorySource(
+    source = InMemorySource(
         name=path.stem,
-        digest=judge.stretch.digest(digest),
+        digest=digest,
         time=time,
         motion=motion,
         moved=everywhere,
         views=view,
         seen=everywhere,
         label=np.full(len(time), -1, np.int32),
-        truth=truth,
     )
+    place = lambda row: f"{path}, frame {row * video.every}"  # noqa: E731
+    # Visual odometry has no scale, so its lengths cannot be compared with those of the truth.
+    return replace(judged(source, [], judge, str(path), place), truth=truth)
 
 
 def _contradictions(config: RecordingConfig) -> list[InputError]:

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -74,20 +73,15 @@ class InMemorySource(ClosedSource):
     def __iter__(self) -> Iterator[Sample]:
         shape, alive = self.view_shape, np.broadcast_to(self.alive, (self.length, self.whiskers))
         columns = (self.time.tolist(), self.motion, self.views, self.seen, self.label)
-        truths: Iterable[np.ndarray | None] = repeat(None, self.length)
-        if self.truth is not None:
-            truths = (None if np.isnan(truth).any() else truth.copy() for truth in self.truth)
-        touches: Iterable[dict[str, np.ndarray]] = repeat({}, self.length)
-        if self.contact is not None and self.point is not None:
-            pairs = zip(self.contact, self.point, strict=True)
-            touches = ({"contact": contact.copy(), "point": point.copy()} for contact, point in pairs)
-        rows = zip(*columns, alive, truths, touches, strict=True)
-        for time, motion, view, seen, label, works, truth, touch in rows:
+        for row, (time, motion, view, seen, label) in enumerate(zip(*columns, strict=True)):
             picture = view if seen else None
             reading = observation(
                 Odometry(*motion), picture, view_shape=shape, label=label, whiskers=self.whiskers
-            )
-            yield Sample(time, reading._replace(alive=works.copy(), **touch), truth)
+            )._replace(alive=alive[row].copy())
+            if self.contact is not None and self.point is not None:
+                reading = reading._replace(contact=self.contact[row].copy(), point=self.point[row].copy())
+            known = self.truth is not None and not np.isnan(self.truth[row]).any()
+            yield Sample(time, reading, self.truth[row].copy() if self.truth is not None and known else None)
 
 
 def load_into_memory(source: Source) -> InMemorySource:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -19,7 +20,7 @@ def require_file(path: Path) -> None:
     Raises:
         InputError: the file is missing, not a regular file, not readable, or empty.
     """
-    try:
+    with readable(path):
         if path.is_dir():
             raise InputError(str(path), "is a folder", "a file")
         if not path.exists():
@@ -34,14 +35,16 @@ def require_file(path: Path) -> None:
         with path.open("rb") as file:
             if not file.read(1):
                 raise InputError(str(path), "is empty", "a recording", "was it copied completely?")
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Turns an error of the operating system in reading a file into an `InputError`."""
+    try:
+        yield
     except OSError as error:
-        raise unreadable_error(path, error) from error
-
-
-def unreadable_error(path: Path, error: OSError) -> InputError:
-    """An `InputError` for an error of the operating system."""
-    cure = "make it readable for this user" if isinstance(error, PermissionError) else ""
-    return InputError(str(path), f"cannot be read ({error.strerror or error})", cure=cure)
+        cure = "make it readable for this user" if isinstance(error, PermissionError) else ""
+        raise InputError(str(path), f"cannot be read ({error.strerror or error})", cure=cure) from error
 
 
 def read_bytes(path: Path) -> bytes:
@@ -51,34 +54,23 @@ def read_bytes(path: Path) -> bytes:
         InputError: see `require_file`.
     """
     require_file(path)
-    try:
+    with readable(path):
         return path.read_bytes()
-    except OSError as error:
-        raise unreadable_error(path, error) from error
 
 
-def digest_of(contents: Iterable[bytes]) -> str:
-    """SHA-256 (hex) of the concatenated contents."""
-    total = hashlib.sha256()
-    for content in contents:
-        total.update(content)
-    return total.hexdigest()
-
-
-def digest_of_files(paths: Iterable[Path], more: bytes = b"") -> str:
-    """SHA-256 (hex) of the contents of files, which may be larger than the memory, and of more.
+def digest_of(contents: Iterable[bytes | Path]) -> str:
+    """SHA-256 (hex) of the contents one after another, also those of files, which may exceed the memory.
 
     Raises:
-        InputError: one cannot be read.
+        InputError: a file cannot be read.
     """
     total = hashlib.sha256()
-    for path in paths:
-        try:
-            with path.open("rb") as file:
-                hashlib.file_digest(file, lambda: total)
-        except OSError as error:
-            raise unreadable_error(path, error) from error
-    total.update(more)
+    for content in contents:
+        if isinstance(content, bytes):
+            total.update(content)
+            continue
+        with readable(content), content.open("rb") as file:
+            hashlib.file_digest(file, lambda: total)
     return total.hexdigest()
 
 

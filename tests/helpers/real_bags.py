@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.transforms import yaw_of
+from robot.recordings.bags.transforms import pose_in_plane
 from robot.recordings.csv_file import read_csv
 from robot.sources.odometry import from_motions
 from tactile.base.se2 import integrate
@@ -77,7 +77,10 @@ def _bag(
         for time, row in zip(truth[0], truth[1].tolist(), strict=True)
     ]
     for name, (stamps, rows) in {"odometry": wheels, "truth": truth}.items():
-        held = [[x, y, yaw_of(**quaternion(heading))] for x, y, heading in rows.tolist()]
+        held = []
+        for x, y, heading in rows.tolist():
+            turn = quaternion(heading)
+            held.append(pose_in_plane((x, y, 0.0), (0.0, 0.0, turn["z"], turn["w"]), name))
         _write_table(folder / f"{name}.csv", ["x", "y", "heading"], stamps, held)
     beams = [np.asarray(entry.fields["ranges"], float).tolist() for entry in scans]
     names = [f"r{number}" for number in range(len(beams[0]))]

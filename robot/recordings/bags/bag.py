@@ -9,21 +9,22 @@ from __future__ import annotations
 import bz2
 import io
 import re
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from copy import copy
 from functools import cached_property
 from heapq import heappop, heappush, merge
 from pathlib import Path
-from types import SimpleNamespace, TracebackType
+from types import SimpleNamespace
 from typing import IO, Any, Literal, NamedTuple, Self, cast
 
 import numpy as np
 import zstandard
 
 from robot.recordings.input_judge import GAP, LEAST_GAP
+from robot.recordings.mcap_reader import CONVERT, container_fault
 from robot.recordings.sanity_checks import WHOLE, Stretch, leave_out
-from robot.sources.input_files import missing_error, raise_errors, require_file, unreadable_error
+from robot.sources.input_files import missing_error, raise_errors, readable, require_file
 from tactile.base.bounded import check_size, expand
 from tactile.base.errors import InputError
 
@@ -72,14 +73,11 @@ def _bound_expansion() -> None:
 SUFFIXES = (".bag", ".db3", ".mcap")
 """Of files that can be bags."""
 METADATA = "metadata.yaml"
-MCAP = b"\x89MCAP0\r\n"  # first and last bytes of a file
 REPAIR = "was it copied and closed completely? try `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
-_CONVERT = (
-    "give the .bag or .db3 that it was made from, or convert that to ROS 2 messages (profile ros2, cdr) with "
-    "`mcap convert` or `rosbags-convert`"
-)
 TRANSFORMS = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})
 """Types of /tf, of ROS 2 and 1 and of early ROS 1."""
+Clock = Literal["header", "bag"]
+OTHER_CLOCK: dict[Clock, Clock] = {"header": "bag", "bag": "header"}
 ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of a compressed message; CDR begins with 00
 
 
@@ -100,20 +98,22 @@ class Bag:
             parts of a ROS 1 bag.
         warn: called with one sentence for whatever is in the bag and is not read; once for each.
         stretch: of the times of receipt; only messages within it are read, besides fixed transforms.
+        clock: which times its messages have, where they have a header.
 
     Attributes:
-        topics: by name. warn: that function.
+        topics: by name. other_clock: the setting that takes the other times of the messages.
 
     Raises:
         InputError: the bag is missing, damaged or empty, or rosbags is not installed.
     """
 
     def __init__(
-        self, path: Path, warn: Callable[[str], None] | None = None, stretch: Stretch = WHOLE
+        self, path: Path, warn: Callable[[str], None], stretch: Stretch = WHOLE, clock: Clock = "header"
     ) -> None:
         path = path.parent if path.name == METADATA else path
         self.path, self._stack, self._told, self._warn = path, ExitStack(), set[str](), warn
-        self._stretch = stretch
+        self._stretch, self.clock = stretch, clock
+        self.other_clock = f"--set recording.topics.clock={OTHER_CLOCK[clock]}"
         files = bag_files(path)
         try:
             from rosbags import rosbag1, rosbag2
@@ -149,7 +149,8 @@ class Bag:
             raise InputError(str(path), "a bag without messages", "at least one message")
 
     def warn(self, sentence: str) -> None:
-        if self._warn is not None and sentence not in self._told:
+        """Tells a sentence, once."""
+        if sentence not in self._told:
             self._warn(sentence)
         self._told.add(sentence)
 
@@ -166,14 +167,14 @@ class Bag:
                 topics[name] = Topic(name, both, max(known.total, totals[name]))
         return dict(sorted(topics.items()))
 
-    def topic(self, name: str, key: str) -> Topic:
+    def topic(self, name: str, key: str, kinds: Iterable[str] = ()) -> Topic:
         """The topic of this name; a leading slash may be missing.
 
         Args:
-            key: configuration key of the name, for errors.
+            key: configuration key of the name, for errors. kinds: types that it can have; () for any.
 
         Raises:
-            InputError: there is no such topic, or it has no messages.
+            InputError: there is no such topic, it has no messages, or another type.
         """
         spellings = (name, f"/{name}", name.removeprefix("/"))
         found = next((self.topics[each] for each in spellings if each in self.topics), None)
@@ -181,6 +182,9 @@ class Bag:
             raise missing_error(str(self.path), "topic", name, list(self.topics), key)
         if not found.total:
             raise InputError(f"{self.path}, {found.name}", "no messages", "at least one message")
+        if kinds and found.kind not in kinds:
+            said = f"messages of type {found.kind}"
+            raise InputError(f"{self.path}, {found.name}", said, f"one of {', '.join(kinds)}")
         return found
 
     def usable(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any, Any]]:
@@ -208,6 +212,16 @@ class Bag:
                 yield number, time, content, value
         if first is not None:
             raise_errors(leave_out(spoilt, good + spoilt, "messages", first, self.warn))
+
+    def stamp(self, content: Any, received: int, clock: Clock | None = None) -> int:
+        """The time of a message received at this time, ns, by a clock; None: that of the bag."""
+        stamped = (clock or self.clock) == "header" and hasattr(content, "header")
+        return nanoseconds(content.header.stamp) if stamped else received
+
+    def stamped(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any]]:
+        """Number, time in ns, and what `read` makes of each message that can be used (see `usable`)."""
+        for number, received, content, value in self.usable(topic, read):
+            yield number, self.stamp(content, received), value
 
     def _decoded(self, topic: Topic) -> Iterator[tuple[int, int, Any]]:
         """The messages with numbers and times of receipt; an `InputError` instead of one that cannot be
@@ -281,7 +295,7 @@ class Bag:
         ]
         coded = {getattr(each.ext, "serialization_format", "cdr") for each in connections} - {"cdr"}
         if coded:
-            raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", _CONVERT)
+            raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", CONVERT)
         known = ("*", self._store.generate_msgdef(topic.kind)[1]) if self._first else ()
         if self._first and any(each.digest not in known for each in connections):
             raise InputError(where, f"another definition of {topic.kind}", "that of ROS Noetic")
@@ -289,9 +303,7 @@ class Bag:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._stack.close()
 
 
@@ -299,11 +311,10 @@ class Bag:
 def _damage_errors(path: Path) -> Iterator[None]:
     """Turns whatever a reader of damaged bytes raises into an `InputError`."""
     try:
-        yield
+        with readable(path):
+            yield
     except InputError:
         raise
-    except OSError as error:
-        raise unreadable_error(path, error) from error
     except Exception as error:
         found, cure = container_fault(path) or (f"cannot be read as a bag: {_reason(error)}", REPAIR)
         raise InputError(str(path), found, "a whole bag", cure) from error
@@ -311,38 +322,6 @@ def _damage_errors(path: Path) -> Iterator[None]:
 
 def _reason(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
-
-
-def container_fault(path: Path) -> tuple[str, str] | None:
-    """What is wrong with an MCAP file as a container, and the cure; None for others."""
-    from mcap.records import Channel, Chunk, Header, Message, Schema
-    from mcap.stream_reader import StreamReader
-
-    from robot.recordings.mcap_scanner import open_chunk
-
-    if path.is_dir():
-        return next(filter(None, map(container_fault, sorted(path.glob("*.mcap")))), None)
-    if path.suffix != ".mcap":
-        return None
-    profile, codes = "", set[str]()
-    with path.open("rb") as file:
-        with suppress(Exception):  # damage
-            for record in StreamReader(file, emit_chunks=True).records:
-                if isinstance(record, Header):
-                    profile = record.profile or "none"
-                for each in open_chunk(record) if isinstance(record, Chunk) else [record]:
-                    if isinstance(each, (Channel, Schema)):
-                        codes.add(each.message_encoding if isinstance(each, Channel) else each.encoding)
-                if isinstance(record, (Chunk, Message)):
-                    break
-        file.seek(-min(file.seek(0, 2), len(MCAP)), 2)
-        whole = file.read() == MCAP
-    if profile and (profile != "ros2" or codes - {"cdr", "ros2msg", "ros2idl", "omgidl", ""}):
-        found = f"an MCAP file of profile {profile} with {', '.join(sorted(codes))}, not of ROS 2"
-        return f"cannot be read as a bag: {found}", _CONVERT
-    if whole or not profile:
-        return None
-    return "cannot be read as a bag: a ROS 2 bag that is cut off", f"`mcap recover {path.name} -o whole.mcap`"
 
 
 def bag_files(path: Path) -> list[Path]:
@@ -411,26 +390,6 @@ def _scanned(reader: Any, chosen: list[Any]) -> Iterator[tuple[Any, int, bytes]]
             yield connection, moment, raw
 
 
-Clock = Literal["header", "bag"]
-OTHER_CLOCK: dict[Clock, Clock] = {"header": "bag", "bag": "header"}
-
-Report = Callable[[str], None]
-
-
-def stamp_of(content: Any, received: int, clock: Clock) -> int:
-    """The time of a message received at this time, ns, by a clock."""
-    stamped = clock == "header" and hasattr(content, "header")
-    return nanoseconds(content.header.stamp) if stamped else received
-
-
-def read_usable(
-    bag: Bag, topic: Topic, clock: Clock, read: Callable[[Any, str], Any]
-) -> Iterator[tuple[int, int, Any]]:
-    """Number, time in ns, and what `read` makes of each message that can be used (see `Bag.usable`)."""
-    for number, received, content, value in bag.usable(topic, read):
-        yield number, stamp_of(content, received, clock), value
-
-
 def nanoseconds(stamp: Any) -> int:
     """A time message in ns."""
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
@@ -442,7 +401,7 @@ def in_seconds(stamps: list[int]) -> np.ndarray:
 
 
 def usable_stamps(
-    stamps: list[int], where: str, clock: Clock, report: Report, other: list[int] | None = None
+    bag: Bag, stamps: list[int], where: str, other: list[int] | None = None
 ) -> tuple[np.ndarray, list[InputError]]:
     """The messages to use: [M] bool. Those that repeat a stamp, a few with stamp 0 and a few out of order are
     left out and reported.
@@ -453,14 +412,14 @@ def usable_stamps(
     Errors: more stamps than `SPOILT` are 0 or out of order.
     """
     times = np.array(stamps, np.int64)
-    worse = clock == "bag" if other is None else bool((np.diff(other) < 0).any())
-    cure = "" if worse else other_clock(clock)
+    worse = bag.clock == "bag" if other is None else bool((np.diff(other) < 0).any())
+    cure = "" if worse else bag.other_clock
     errors, use = list[InputError](), times != 0
 
     def drop(wrong: np.ndarray, row: int, found: str, expected: str) -> None:
         """Leaves out the messages [M] bool; row: the first that is named."""
         first = InputError(f"{where}, message {row}", found, expected, cure)
-        errors.extend(leave_out(int(wrong.sum()), len(times), "messages", first, report))
+        errors.extend(leave_out(int(wrong.sum()), len(times), "messages", first, bag.warn))
         use[wrong] = False
 
     drop(~use, int((~use).argmax()), "the stamp is 0", "the time of the measurement")
@@ -476,18 +435,11 @@ def usable_stamps(
     rows = np.flatnonzero(use)
     repeated = rows[np.append(False, np.diff(times[rows]) == 0)]
     if len(repeated):
-        said = (
-            f"{len(repeated)} of {len(times)} messages repeat the stamp of the message before, the first at "
-        )
-        said += f"{times[repeated[0]] / 1e9:.3f} s; they are left out"
-        report(f"{where}: {said}{f'; {cure}' if cure and len(repeated) > len(times) / 2 else ''}")
+        said = f"{len(repeated)} of {len(times)} messages repeat the stamp of the message before, the first "
+        said += f"at {times[repeated[0]] / 1e9:.3f} s; they are left out"
+        bag.warn(f"{where}: {said}{f'; {cure}' if cure and len(repeated) > len(times) / 2 else ''}")
         use[repeated] = False
     return use, errors
-
-
-def other_clock(clock: Clock) -> str:
-    """The setting that takes the other times of the messages."""
-    return f"--set recording.topics.clock={OTHER_CLOCK[clock]}"
 
 
 def leaps(times: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -506,6 +458,8 @@ class Series(NamedTuple):
         where: file and topic, for errors. time: [M] s, increasing. values: [M, ...].
         numbers: [M] message of each value. errors: found in it; without any, M is at least 1.
         clock: the setting that takes the other times, where these leap and the others do not; else ''.
+        body: of odometry, frame of the robot, '' if the bag does not say. held: whether it was velocities.
+        poses: [M, 3] of odometry as recorded; None if there are none.
     """
 
     where: str
@@ -514,18 +468,20 @@ class Series(NamedTuple):
     numbers: np.ndarray
     errors: list[InputError]
     clock: str = ""
+    body: str = ""
+    held: bool = False
+    poses: np.ndarray | None = None
 
     def place(self, row: int) -> str:
         return f"{self.where}, message {self.numbers[row]}"
 
 
 def as_series(
+    bag: Bag,
     where: str,
     numbers: list[int],
     stamps: list[int],
     values: np.ndarray,
-    clock: Clock,
-    report: Report,
     other: list[int] | None = None,
 ) -> Series:
     """The values [M, ...] of messages with usable stamps.
@@ -535,7 +491,7 @@ def as_series(
     """
     if not stamps:
         raise InputError(where, "no message that can be used", "at least one")
-    use, errors = usable_stamps(stamps, where, clock, report, other)
+    use, errors = usable_stamps(bag, stamps, where, other)
     leap = other is not None and leaps(np.array(stamps)[use], np.array(other)[use]).any()
-    cure = other_clock(clock) if leap else ""
+    cure = bag.other_clock if leap else ""
     return Series(where, in_seconds(stamps)[use], values[use], np.array(numbers)[use], errors, cure)

@@ -1,7 +1,11 @@
-"""What a bag holds: topics, rates, gaps, frames, shapes and magnitudes, and what each topic can serve as."""
+"""What a bag holds: topics, rates, gaps, frames, shapes and magnitudes, and what each topic can serve as; the
+settings that read it.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -10,8 +14,10 @@ import numpy as np
 from robot.recordings.bags.bag import Bag, Topic, leaps, nanoseconds
 from robot.recordings.bags.bag_reader import ARRAYS, JOINTS
 from robot.recordings.bags.transforms import (
+    BODIES,
     FORWARD,
     MOVING,
+    ODOMETRY,
     POSES,
     STATIC,
     TWISTS,
@@ -69,59 +75,25 @@ class Times(NamedTuple):
         return max(self.zero, self.backwards) <= max(1, SPOILT * self.total)
 
 
-class ScanShape(NamedTuple):
-    """LaserScan.
+class Shape(NamedTuple):
+    """What the messages of a topic hold.
 
     Attributes:
-        beams: median number. extent: directions of all messages together; wider: if the first has fewer.
-        high: limit of the range, m. median: of the ranges within the limits, m, NaN if there are none.
-        nothing: share of beams without an object in range.
+        words: all of it, for a reader. size: beams of a scan (the median); width and height of an image,
+            pixels; dimensions of values.
+        low, high: of all values (positions of joints); high: of scans, limit of the range, m.
+        extent: directions of all scans together; wider: if the first has fewer.
+        pose_path, twist_path: length of poses and of velocities, m, NaN without these.
     """
 
-    beams: int
-    extent: Extent
-    wider: bool
-    high: float
-    median: float
-    nothing: float
-
-
-class CloudShape(NamedTuple):
-    """PointCloud2. Attributes: points: of the first message. reach: median distance, m."""
-
-    points: int
-    reach: float
-
-
-class ImageShape(NamedTuple):
-    """Image, CompressedImage. Attributes: width, height: of the first message, pixels. encoding: or format.
-    grey: mean, 0 to 255."""
-
-    width: int
-    height: int
-    encoding: str
-    grey: float
-
-
-class ValueShape(NamedTuple):
-    """JointState, MultiArray. Attributes: sizes: of the layout's dimensions, else the number of values. low,
-    high: of all values (positions of joints)."""
-
-    sizes: tuple[int, ...]
-    low: float
-    high: float
-
-
-class MotionShape(NamedTuple):
-    """Poses, velocities: length in m and typical speed in m/s of each, NaN without these."""
-
-    pose_path: float
-    pose_speed: float
-    twist_path: float
-    twist_speed: float
-
-
-Shape = ScanShape | CloudShape | ImageShape | ValueShape | MotionShape
+    words: str
+    size: tuple[int, ...] = ()
+    low: float = np.nan
+    high: float = np.nan
+    extent: Extent | None = None
+    wider: bool = False
+    pose_path: float = np.nan
+    twist_path: float = np.nan
 
 
 class TopicDescription(NamedTuple):
@@ -154,7 +126,6 @@ class BagDescription(NamedTuple):
             whether it is fixed (on /tf_static) and the number of transforms. notes: what is left out.
     """
 
-    path: Path
     topics: tuple[TopicDescription, ...]
     links: tuple[tuple[str, str, bool, int], ...]
     notes: tuple[str, ...] = ()
@@ -173,11 +144,11 @@ def describe_bag(path: Path) -> BagDescription:
         links = []
         for name in (MOVING, STATIC):
             try:
-                found = read_links(bag, name, "header")
+                found = read_links(bag, name)
             except InputError:
                 continue  # the fault of the topic says why
             links += [(*pair, name == STATIC, len(link)) for pair, link in found.items()]
-    return BagDescription(path, topics, tuple(links), tuple(told))
+    return BagDescription(topics, tuple(links), tuple(told))
 
 
 _ROLES: dict[str, tuple[Role, ...]] = {
@@ -251,7 +222,8 @@ def _summary_of(content: Any, kind: str, where: str) -> Any:
     if kind in IMAGES:
         grey = grey_image(content, kind, where)
         encoding = content.encoding if kind == RAW else content.format
-        return ImageShape(grey.shape[1], grey.shape[0], encoding, float(grey.mean()))
+        height, width = grey.shape
+        return Shape(f"{width} x {height} {encoding}, mean grey {grey.mean():.0f}", (width, height))
     if kind == JOINTS:
         return (len(content.name),), np.asarray(content.position, float)
     if kind in ARRAYS:
@@ -269,30 +241,129 @@ def _shape_of(bag: Bag, kind: str, kept: list[Any], stamps: list[int]) -> Shape:
         known = [median for median in medians if np.isfinite(median)]
         median = float(np.median(known)) if known else np.nan
         if len(set(frames)) > 1:  # directions in the frame of the first
-            mounts = {each: mount_of(bag, "", each, "header") or FORWARD for each in dict.fromkeys(frames)}
+            mounts = {each: mount_of(bag, "", each) or FORWARD for each in dict.fromkeys(frames)}
             turned = zip(frames, extents, strict=True)
             extents = tuple(own.turned(mounts[frame], mounts[frames[0]]) for frame, own in turned)
-        wider = wider_extent(extents)
-        absent = float(np.mean(nothing))
-        return ScanShape(
-            int(np.median(beams)), wider or extents[0], wider is not None, highs[0], median, absent
-        )
+        wider, count = wider_extent(extents), int(np.median(beams))
+        extent = wider or extents[0]
+        turn = "all around" if extent.ring else f"over {np.degrees(abs(extent.width)):.0f} degrees"
+        words = f"{count} beams {turn}, median {median:.2g} m, {np.mean(nothing):.0%} empty"
+        return Shape(words, (count,), high=highs[0], extent=extent, wider=wider is not None)
     if kind == CLOUD:
         points = kept[0][np.isfinite(kept[0]).all(axis=1)]
         reach = float(np.median(np.hypot(points[:, 0], points[:, 1]))) if len(points) else np.nan
-        return CloudShape(len(kept[0]), reach)
+        return Shape(f"{len(kept[0])} points, median {reach:.2g} m away")
     if kind in IMAGES:
         return kept[0]
     if kind in (JOINTS, *ARRAYS):
         numbers = np.concatenate([value for _, value in kept])
         low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (np.nan, np.nan)
-        return ValueShape(kept[0][0], low, high)
-    rows, time, sizes = np.array(kept), np.array(stamps, float) / 1e9, list[float]()
+        words = f"{' x '.join(map(str, kept[0][0]))} values from {low:.3g} to {high:.3g}"
+        return Shape(words, kept[0][0], low, high)
+    rows, time, paths, speeds = np.array(kept), np.array(stamps, float) / 1e9, list[float](), list[float]()
     order = np.argsort(time, kind="stable")
     rows, time = rows[order], time[order]
     for motion in (from_poses(time, rows[:, :3]), from_velocities(time, *rows[:, 3:].T)):
         measured = np.isfinite(motion[:, 0]).any()
         track = MotionTrack(time, np.ones(len(time), bool), motion)
-        path = float(np.nansum(np.hypot(motion[:, 0], motion[:, 1])))
-        sizes += [path, typical_motion(track).speed] if measured else [np.nan, np.nan]
-    return MotionShape(*sizes)
+        paths.append(float(np.nansum(np.hypot(motion[:, 0], motion[:, 1]))) if measured else np.nan)
+        speeds.append(typical_motion(track).speed)
+    first = 0 if np.isfinite(paths[0]) else 1
+    words = f"{paths[first]:.3g} m at {speeds[first]:.2g} m/s"
+    return Shape(words, pose_path=paths[0], twist_path=paths[1])
+
+
+TRUE = re.compile(r"truth|(^|[/_])gt([/_]|$)|mocap|vicon|optitrack|qualisys|ideal", re.IGNORECASE)
+"""Names of topics and frames with true poses."""
+WHEELS = re.compile(r"/?(|.+[/_.-])(odom|odom_combined)")
+"""Frames whose link to the robot in /tf is odometry, and the prefix of the robot."""
+LEAST_PATH = 0.01  # m: poses or velocities with less do not tell how the robot moved
+
+
+def suggested_topics(bag: BagDescription) -> dict[str, Any]:
+    """`recording.topics` that read the bag; {} if it has neither odometry nor images."""
+    truth = _first(bag, "truth", [topic for topic in bag.topics if TRUE.search(topic.name)])
+    odometry, wheels = _odometry(bag, truth)
+    views, touch = _views(bag), None
+    if views is None:
+        touch = _first(bag, "touch", [topic for topic in bag.topics if topic.kind != JOINTS])
+    found: dict[str, Any] = {}
+    if odometry is not None:
+        found["odometry"] = odometry
+    elif views is None or views[0].kind not in IMAGES:
+        return {}
+    seen = views[0] if views else None
+    if views is not None:
+        found["views"] = views[1]
+    elif touch is not None and touch.shape is not None:
+        seen, found["touch"] = touch, touch.name
+        low, high = touch.shape.low, touch.shape.high
+        if low < high and not (low >= 0 and high <= 1):
+            found["touch"] = {"topic": touch.name, "low": low, "high": high}
+    if truth is not None:
+        found["truth"] = truth.name
+    used = [topic for topic in (wheels, seen, truth) if topic is not None]
+    if not _headers_serve(used):
+        found["clock"] = "bag"
+    if seen is not None and wheels is not None and seen.received.rate_hz > 1.2 * wheels.received.rate_hz:
+        found["samples"] = "views"
+    return found
+
+
+def _odometry(bag: BagDescription, truth: TopicDescription | None) -> tuple[Any, TopicDescription | None]:
+    """The setting, and the topic that it names."""
+    others = [topic for topic in bag.topics if topic != truth]
+    best = _first(bag, "odometry", [topic for topic in others if topic.kind == ODOMETRY])
+    best = best or _first(bag, "odometry", others)
+    if best is None:
+        robots = robots_of(bag)
+        return ({"tf": list(robots[0])} if robots else None), None
+    shape = best.shape
+    still = shape is not None and not shape.pose_path > LEAST_PATH
+    if best.kind == ODOMETRY and shape is not None and still and shape.twist_path > LEAST_PATH:
+        return {"topic": best.name, "use": "twist"}, best
+    return best.name, best
+
+
+def robots_of(bag: BagDescription) -> list[tuple[str, str]]:
+    """The frames of the odometry and of the body of each robot in /tf; that with a view comes first."""
+    found = []
+    for parent, child, fixed, total in bag.links:
+        named = None if fixed or total < 2 else WHEELS.fullmatch(parent)
+        if named and child in [named[1] + body for body in (*BODIES, "base")]:
+            found.append((named[1], (parent, child)))
+    views = _views(bag)
+    frame = "" if views is None else views[0].frame
+    return [pair for prefix, pair in sorted(found, key=lambda each: not frame.startswith(each[0]))]
+
+
+def _views(bag: BagDescription) -> tuple[TopicDescription, Any] | None:
+    for kinds in ((SCAN,), (CLOUD,), IMAGES):
+        topic = _first(bag, "views", [topic for topic in bag.topics if topic.kind in kinds])
+        if topic is not None:
+            shape = topic.shape
+            options: dict[str, Any] = {}
+            if shape is not None and shape.extent is not None:  # of scans
+                if shape.size[0] < 18:  # sectors of a view by default
+                    options = {"rows": 1, "columns": shape.size[0]}
+                if shape.wider:
+                    options["span"] = [round(angle, 4) for angle in shape.extent.span]
+            return topic, {"topic": topic.name, **options} if options else topic.name
+    return None
+
+
+def _first(bag: BagDescription, role: str, topics: Sequence[TopicDescription]) -> TopicDescription | None:
+    """The readable topic with most messages that can serve as this."""
+    able = [topic for topic in topics if role in topic.roles and topic.shape is not None]
+    return max(able, key=lambda topic: topic.total, default=None)
+
+
+def _headers_serve(topics: Sequence[TopicDescription]) -> bool:
+    """Whether the stamps in the headers are in order, do not leap where the bag does not, on one clock."""
+    stamped = [topic.stamped for topic in topics if topic.stamped is not None]
+    if not all(times.in_order and not times.leaps - times.backwards for times in stamped):
+        return False
+    clocks: list[Times] = [topic.stamped or topic.received for topic in topics]
+    return not clocks or bool(
+        np.max([times.first for times in clocks]) <= np.min([times.last for times in clocks])
+    )

@@ -5,52 +5,36 @@ topic.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robot.recordings.alignment import (
-    RecordingRows,
-    interpolated_poses,
-    nearest_rows,
-    no_overlap_error,
-)
-from robot.recordings.bags.bag import (
-    Bag,
-    Clock,
-    Report,
-    Series,
-    as_series,
-    bag_files,
-    other_clock,
-    read_usable,
-)
-from robot.recordings.bags.bag_odometry import BagOdometry, motion_at, read_odometry, read_poses
+from robot.recordings.alignment import blank_rows, interpolated_poses, judged, nearest_rows, no_overlap_error
+from robot.recordings.bags.bag import Bag, Series, as_series, bag_files
 from robot.recordings.bags.topics_config import OdometryTopic, TopicsConfig, TouchTopic, ViewsTopic
+from robot.recordings.bags.transforms import read_odometry, read_poses
 from robot.recordings.bags.views import IMAGES, KEY, read_image_views, read_range_views
-from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack, unit_cure
+from robot.recordings.input_judge import InputJudge, MotionTrack, unit_cure
+from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import SPOILT
-from robot.recordings.video import ImageViewConfig, VisualOdometryConfig
 from robot.sources.in_memory import InMemorySource
-from robot.sources.input_files import digest_of_files, missing_error, raise_errors
+from robot.sources.input_files import digest_of, missing_error, raise_errors
+from robot.sources.odometry import from_poses
 from tactile.base.errors import InputError
+from tactile.base.se2 import integrate
 
 JOINTS = "sensor_msgs/msg/JointState"
 ARRAYS = ("std_msgs/msg/Float32MultiArray", "std_msgs/msg/Float64MultiArray")
 
 
-def _read_touch(bag: Bag, config: TouchTopic, clock: Clock, report: Report) -> Series:
+def _read_touch(bag: Bag, config: TouchTopic) -> Series:
     """Touch [M, R, C, 1] in 0..1.
 
     Raises:
         InputError: the topic does not exist, has another type, or its values do not fill rows and columns.
     """
-    topic = bag.topic(config.topic, "recording.topics.touch")
+    topic = bag.topic(config.topic, "recording.topics.touch", (JOINTS, *ARRAYS))
     where = f"{bag.path}, {topic.name}"
-    if topic.kind not in (JOINTS, *ARRAYS):
-        expected = f"one of {JOINTS}, {', '.join(ARRAYS)}"
-        raise InputError(where, f"messages of type {topic.kind}", expected)
     names, shape, known = config.joints, None, list[str]()
 
     def read(content: Any, place: str) -> np.ndarray | None:
@@ -75,14 +59,14 @@ def _read_touch(bag: Bag, config: TouchTopic, clock: Clock, report: Report) -> S
             names = names or tuple(content.name)
         return value
 
-    rows = [row for row in read_usable(bag, topic, clock, read) if row[2] is not None]
+    rows = [row for row in bag.stamped(topic, read) if row[2] is not None]
     numbers, stamps, values = ([row[k] for row in rows] for k in range(3))
     if not values:
         absent = next((name for name in names if name not in known), None)
         if absent is not None:
             raise missing_error(where, "joint", absent, known, "recording.topics.touch.joints")
     scaled = (np.array(values) - config.low) / (config.high - config.low)
-    series = as_series(where, numbers, stamps, scaled, clock, report)
+    series = as_series(bag, where, numbers, stamps, scaled)
     errors = list(series.errors)
     outside = float(np.mean((scaled < 0) | (scaled > 1)))
     if outside > 0.5:
@@ -125,67 +109,60 @@ NO_VIEWS = (3, 6, 1)  # shape of the masked views of a recording without any
 
 
 @np.errstate(all="ignore")  # what is no number, or far too large, is reported
-def read_bag(
-    path: Path,
-    config: TopicsConfig,
-    judge: InputJudge = DEFAULT_JUDGE,
-    *,
-    image: ImageViewConfig | None = None,
-    visual_odometry: VisualOdometryConfig | None = None,
-) -> InMemorySource:
+def read_bag(settings: RecordingConfig, judge: InputJudge) -> InMemorySource:
     """A bag as a `Source`: one sample for each odometry message, or for each view.
 
     Args:
         judge: is told of every message that is left out, and judges the odometry.
-        image: how images become views. visual_odometry: for a bag of images without odometry.
 
     Raises:
         InputError: the bag is damaged, topics are missing or of another type, or values are impossible.
     """
-    report = judge.say
-    with Bag(path, report, judge.stretch) as bag:
+    path, config = settings.file, settings.topics or TopicsConfig()
+    with Bag(path, judge.say, judge.stretch, config.clock) as bag:
         config = _with_preset(bag, config)
         if config.views is not None and config.touch is not None:
             raise InputError("recording.topics", "both views and touch", "one of them")
-        if config.odometry is None and (visual_odometry is None or config.views is None):
+        if config.odometry is None and (settings.visual_odometry is None or config.views is None):
             expected = "topics: {odometry: TOPIC}, or images as views and visual_odometry"
             listed = ", ".join(f"{topic.name} ({topic.kind})" for topic in bag.topics.values())
             raise InputError("recording.topics", "no odometry", expected, f"the bag has {listed}")
-        images = image or ImageViewConfig()
-        odometry, views = _read_steps(bag, config, images, visual_odometry, report)
-        truth = None if config.truth is None else read_poses(bag, config.truth, config.clock, report)
+        odometry, views = _read_steps(bag, config, settings)
+        truth = None if config.truth is None else read_poses(bag, config.truth)
     found = [*odometry.errors, *(views.errors if views else []), *(truth.errors if truth else [])]
     raise_errors(list(dict.fromkeys(found)))
     raise_errors(_judge(odometry, judge))
     if views is not None and config.samples == "views":
-        odometry, views = _sample_views(odometry, views, report)
+        odometry, views = _sample_views(bag, odometry, views)
     shape, whiskers = NO_VIEWS, 0
     if views is not None:
-        rows, columns = views.values.shape[1:3]
-        shape, whiskers = (rows, columns, 1), rows * columns if config.touch is not None else 0
-    recording = RecordingRows(str(path), odometry.time, odometry.motion, shape, whiskers)
+        shape = (*views.values.shape[1:3], 1)
+        whiskers = shape[0] * shape[1] if config.touch is not None else 0
+    errors = list[InputError]()
+    rows = blank_rows(path, odometry.time, odometry.values, shape)
     if views is not None:
         part = config.views or config.touch
-        _place_views(recording, views, part.tolerance if part else None, report)
+        errors += _place_views(bag, rows, views, part.tolerance if part else None)
     if truth is not None:
-        recording.truth, faults = interpolated_poses(
+        rows["truth"], faults = interpolated_poses(
             odometry.time, truth.time, truth.values, "time", truth.where
         )
-        recording.errors += faults
-    judge = replace(judge, warn=None)  # the odometry is judged: only the truth is compared
-    return recording.source(path.stem, digest_of_files(bag_files(path)), judge)
+        errors += faults
+    source = InMemorySource(digest=digest_of(bag_files(path)), alive=np.ones(whiskers, bool), **rows)
+    # The odometry is judged: only the truth is compared.
+    return judged(source, errors, replace(judge, warn=None), str(path))
 
 
-def _judge(odometry: BagOdometry, judge: InputJudge) -> list[InputError]:
+def _judge(odometry: Series, judge: InputJudge) -> list[InputError]:
     """Judges the odometry as recorded, each step by the number of its message."""
-    time, motion, where = odometry.time, odometry.motion, odometry.where
-    track = MotionTrack(time, np.ones(len(time), bool), motion, None, odometry.held, odometry.poses)
+    time, clock = odometry.time, odometry.clock
+    track = MotionTrack(time, np.ones(len(time), bool), odometry.values, None, odometry.held, odometry.poses)
 
     def cures(quantity: str, unit: str) -> str:
-        return odometry.clock or other_clock("header") if quantity == "time" else unit_cure(quantity, unit)
+        receipt = clock or "--set recording.topics.clock=bag"
+        return receipt if quantity == "time" else unit_cure(quantity, unit)
 
-    place = lambda row: f"{where}, message {odometry.numbers[row]}"  # noqa: E731
-    return judge.errors(track, place, where, odometry.clock, cures)
+    return judge.errors(track, odometry.place, odometry.where, clock, cures)
 
 
 def _with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
@@ -210,54 +187,45 @@ def _with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
     return config.model_copy(update=found)
 
 
-def _read_steps(
-    bag: Bag,
-    config: TopicsConfig,
-    image: ImageViewConfig,
-    visual_odometry: VisualOdometryConfig | None,
-    report: Report,
-) -> tuple[BagOdometry, Series | None]:
+def _read_steps(bag: Bag, config: TopicsConfig, settings: RecordingConfig) -> tuple[Series, Series | None]:
     """The odometry, and the views or touch readings if there are any."""
-    clock, odometry = config.clock, None
-    if config.odometry is not None:
-        odometry = read_odometry(bag, config.odometry, clock, report)
+    odometry = None if config.odometry is None else read_odometry(bag, config.odometry)
     if config.views is not None and (topic := bag.topic(config.views.topic, KEY)).kind in IMAGES:
-        wanted = None if odometry is not None else visual_odometry
-        views, motion = read_image_views(bag, topic, image, wanted, clock, report)
+        wanted = None if odometry is not None else settings.visual_odometry
+        views, motion = read_image_views(bag, topic, settings.image, wanted)
         if odometry is not None:
             return odometry, views
         assert motion is not None
-        return BagOdometry(views.time, motion, views.where, "", views.errors, views.numbers), views
+        return views._replace(values=motion), views
     if odometry is None:
         raise InputError("recording.visual_odometry", "views without images", "images, or topics.odometry")
     if config.views is not None:
-        body = config.body or odometry.body
-        return odometry, read_range_views(bag, config.views, body, clock, report)
-    return odometry, None if config.touch is None else _read_touch(bag, config.touch, clock, report)
+        return odometry, read_range_views(bag, config.views, config.body or odometry.body)
+    return odometry, None if config.touch is None else _read_touch(bag, config.touch)
 
 
-def _sample_views(odometry: BagOdometry, views: Series, report: Report) -> tuple[BagOdometry, Series]:
+def _sample_views(bag: Bag, odometry: Series, views: Series) -> tuple[Series, Series]:
     """Odometry at the times of the views, and the views within the odometry."""
-    inside, motion = motion_at(views.time, odometry.time, odometry.motion)
+    path = integrate(odometry.values[:, :3])
+    poses, _ = interpolated_poses(views.time, odometry.time, path, "time", views.where)
+    inside = (odometry.time[0] <= views.time) & (views.time <= odometry.time[-1])
     if not inside.any():
         raise no_overlap_error(views.time, odometry.time, "time", views.where)
-    _report_unused(views, ~inside, "outside the times of the odometry", report)
-    views = views._replace(
-        time=views.time[inside], values=views.values[inside], numbers=views.numbers[inside]
-    )
-    return odometry._replace(time=views.time, motion=motion), views
+    _report_unused(bag, views, ~inside, "outside the times of the odometry")
+    columns = {name: getattr(views, name)[inside] for name in ("time", "values", "numbers")}
+    views = views._replace(**columns)
+    return odometry._replace(time=views.time, values=from_poses(views.time, poses[inside])), views
 
 
-def _place_views(recording: RecordingRows, views: Series, tolerance: float | None, report: Report) -> None:
-    """Gives each view to the nearest sample; of several for one sample the nearest is used."""
-    found = nearest_rows(views.time, recording.time, tolerance)
-    assert found is not None  # the clock is checked
-    rows, away, reach = found
+def _place_views(
+    bag: Bag, source: dict[str, Any], views: Series, tolerance: float | None
+) -> list[InputError]:
+    """Gives each view to the nearest row of a source; of several for one row the nearest is used."""
+    rows, away, reach = nearest_rows(views.time, source["time"], tolerance)
     near = away <= reach
     if not near.any():
-        recording.errors.append(no_overlap_error(views.time, recording.time, "time", views.where))
-        return
-    _report_unused(views, ~near, f"over {reach:.3g} s away from every sample", report)
+        return [no_overlap_error(views.time, source["time"], "time", views.where)]
+    _report_unused(bag, views, ~near, f"over {reach:.3g} s away from every sample")
     order = np.lexsort([away, rows])
     order = order[near[order]]
     first = np.concatenate([[True], np.diff(rows[order]) > 0])
@@ -265,13 +233,14 @@ def _place_views(recording: RecordingRows, views: Series, tolerance: float | Non
     beaten = near.copy()
     beaten[use] = False
     why = "farther from their sample than another (or set recording.topics.samples: views)"
-    _report_unused(views, beaten, why, report)
-    recording.views[rows[use]], recording.seen[rows[use]] = views.values[use], True
+    _report_unused(bag, views, beaten, why)
+    source["views"][rows[use]], source["seen"][rows[use]] = views.values[use], True
+    return []
 
 
-def _report_unused(views: Series, unused: np.ndarray, why: str, report: Report) -> None:
+def _report_unused(bag: Bag, views: Series, unused: np.ndarray, why: str) -> None:
     if unused.any():
         first = float(views.time[int(unused.argmax())])
         count = f"{int(unused.sum())} of {len(unused)} views, the first at {first:.3f} s"
         few = "note: " if unused.mean() <= SPOILT else ""
-        report(f"{few}{views.where}: {count}, are {why}; they are left out")
+        bag.warn(f"{few}{views.where}: {count}, are {why}; they are left out")

@@ -1,33 +1,36 @@
-"""Frames of /tf and /tf_static: where a sensor is mounted, and poses between two frames; the poses and
-velocities in messages of other types, in the plane.
+"""Poses of a bag, in the plane: odometry and true poses of topics, and between the frames of /tf and
+/tf_static; where a sensor is mounted.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from itertools import compress
-from types import SimpleNamespace
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from robot.recordings.bags.bag import (
+    OTHER_CLOCK,
     TRANSFORMS,
     Bag,
-    Clock,
-    Report,
     Series,
+    as_series,
     in_seconds,
-    nanoseconds,
-    read_usable,
     usable_stamps,
 )
-from robot.recordings.sanity_checks import leave_out, still_axis
+from robot.recordings.bags.topics_config import OdometryTopic, PoseTopic
+from robot.recordings.sanity_checks import leave_out, nonfinite_errors, still_axis
 from robot.sources.input_files import missing_error, raise_errors
+from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
+from tactile.base.se2 import integrate, wrap
 
 ODOMETRY = "nav_msgs/msg/Odometry"
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 
 
 def frames_of(message: Any) -> tuple[str, str]:
@@ -36,15 +39,8 @@ def frames_of(message: Any) -> tuple[str, str]:
     return frame.lstrip("/"), child.lstrip("/")
 
 
-def yaw_of(x: float, y: float, z: float, w: float) -> float:
-    """Heading of a quaternion, rad in [-pi, pi]: the direction of its x axis in the plane."""
-    return float(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
-
-
-def pose_in_plane(
-    position: Any, orientation: Any, where: str, plane: str = "xy"
-) -> tuple[float, float, float]:
-    """(x m, y m, heading rad) of a position and a quaternion.
+def pose_in_plane(position: Vector, turn: Quaternion, where: str, plane: str = "xy") -> Vector:
+    """(x m, y m, heading rad) of a position (x, y, z) and a quaternion (x, y, z, w).
 
     Args:
         plane: `xy`; `xz` of a camera (x to the right, y down, z ahead): x = z, y = -x, heading of its z axis.
@@ -52,43 +48,43 @@ def pose_in_plane(
     Raises:
         InputError: the quaternion is 0, or a number is not finite.
     """
-    turn = tuple(float(getattr(orientation, axis)) for axis in "xyzw")
     if not any(turn):
         cure = "of odometry, the velocities remain: --set recording.topics.odometry.use=twist"
         raise InputError(where, "the orientation is 0, 0, 0, 0", "a unit quaternion", cure)
-    place = tuple(float(getattr(position, axis)) for axis in plane)
+    place = tuple(position["xyz".index(axis)] for axis in plane)
     for name, values in (("orientation", turn), ("position", place)):
         if not np.isfinite(values).all():
             raise InputError(where, f"the {name} is {', '.join(map(str, values))}", "finite numbers")
+    x, y, z, w = turn
     if plane == "xz":
-        x, y, z, w = turn
         return place[1], -place[0], float(np.arctan2(-2 * (x * z + w * y), w * w + z * z - x * x - y * y))
-    return place[0], place[1], yaw_of(*turn)
+    return place[0], place[1], float(np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z))
 
 
-POSES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
-    ODOMETRY: lambda message: (message.pose.pose.position, message.pose.pose.orientation),
-    "geometry_msgs/msg/PoseStamped": lambda message: (message.pose.position, message.pose.orientation),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: (
-        message.pose.pose.position,
-        message.pose.pose.orientation,
-    ),
-    "geometry_msgs/msg/TransformStamped": lambda message: (
-        message.transform.translation,
-        message.transform.rotation,
-    ),
+def _pose_at(*fields: str) -> Callable[[Any], tuple[Vector, Quaternion]]:
+    """Reads the position (x, y, z) and the quaternion (x, y, z, w) in these fields of a message."""
+
+    def read(message: Any) -> tuple[Vector, Quaternion]:
+        move, turn = attrgetter(*fields)(message)
+        where = float(move.x), float(move.y), float(move.z)
+        return where, (float(turn.x), float(turn.y), float(turn.z), float(turn.w))
+
+    return read
+
+
+_transform = _pose_at("transform.translation", "transform.rotation")
+POSES = {
+    ODOMETRY: _pose_at("pose.pose.position", "pose.pose.orientation"),
+    "geometry_msgs/msg/PoseStamped": _pose_at("pose.position", "pose.orientation"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_at("pose.pose.position", "pose.pose.orientation"),
+    "geometry_msgs/msg/TransformStamped": _transform,
 }
 """Message types with a pose: its position and orientation."""
-
-
-TWISTS: dict[str, Callable[[Any], Any]] = {
-    ODOMETRY: lambda message: message.twist.twist,
-    "geometry_msgs/msg/TwistStamped": lambda message: message.twist,
-}
+TWISTS = {ODOMETRY: attrgetter("twist.twist"), "geometry_msgs/msg/TwistStamped": attrgetter("twist")}
 """Message types with velocities in the frame of the robot."""
 
 
-def plane_errors(points: np.ndarray, where: str, role: str, plane: str) -> list[InputError]:
+def _plane_errors(points: np.ndarray, where: str, role: str, plane: str) -> list[InputError]:
     """The error for positions [M, 3] that lie in another plane than x and y; another one is taken as told."""
     still = still_axis(points) if plane == "xy" and len(points) > 1 else ""
     if not still:
@@ -100,7 +96,7 @@ def plane_errors(points: np.ndarray, where: str, role: str, plane: str) -> list[
     return [InputError(where, found, "a path in the plane of x and y", cure)]
 
 
-def twist_in_plane(twist: Any) -> tuple[float, float, float]:
+def twist_in_plane(twist: Any) -> Vector:
     """(forward m/s, left m/s, turn rad/s) of a twist."""
     return float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
 
@@ -110,7 +106,7 @@ BODIES = ("base_link", "base_footprint")
 """Usual names of the robot's frame."""
 
 
-Link = list[tuple[int, tuple[float, ...], tuple[float, ...], int]]
+Link = list[tuple[int, Vector, Quaternion, int]]
 """The transforms from a frame to a child frame: stamp in ns, (x, y, z) in m, quaternion (x, y, z, w), number
 of the message; one is enough for a fixed link."""
 Links = dict[tuple[str, str], Link]
@@ -128,7 +124,7 @@ class Mount(NamedTuple):
 FORWARD = Mount(np.eye(3), np.zeros(3))
 
 
-def read_links(bag: Bag, name: str, clock: Clock) -> Links:
+def read_links(bag: Bag, name: str) -> Links:
     """All links on /tf or /tf_static, in any namespace; of fixed links (`/tf_static`) the last transform.
 
     Raises:
@@ -140,11 +136,10 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
             continue
         where = f"{bag.path}, {topic.name}"
         spoilt, total, first = 0, 0, None
-        for number, received, content in read_usable(bag, topic, "bag", lambda content, place: content):
+        for number, received, content, _ in bag.usable(topic, lambda content, place: None):
             for each in content.transforms:
                 frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
-                move, turn = each.transform.translation, each.transform.rotation
-                shift, quaternion = (move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)
+                shift, quaternion = _transform(each)
                 total += 1
                 if not (np.isfinite((*shift, *quaternion)).all() and any(quaternion)):
                     place = f"{where}, message {number}, {frames[0]} to {frames[1]}"
@@ -152,7 +147,7 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
                     first = first or InputError(place, found, "numbers, and a unit quaternion")
                     spoilt += 1
                     continue
-                stamp = nanoseconds(each.header.stamp) if clock == "header" else received
+                stamp = bag.stamp(each, received)
                 if name == STATIC:
                     links[frames] = []
                 links.setdefault(frames, []).append((stamp, shift, quaternion, number))
@@ -163,28 +158,19 @@ def read_links(bag: Bag, name: str, clock: Clock) -> Links:
 
 def _chain_between(links: Links, parent: str, child: str) -> _Chain | None:
     """The links from one frame to another, each with whether it is followed downwards; None: unconnected."""
-    neighbours: dict[str, list[tuple[str, tuple[str, str], bool]]] = {}
-    for upper, lower in links:
-        neighbours.setdefault(upper, []).append((lower, (upper, lower), True))
-        neighbours.setdefault(lower, []).append((upper, (upper, lower), False))
-    before: dict[str, tuple[str, tuple[str, str], bool]] = {}
-    queue = deque([parent])
-    while queue and child not in before:
-        frame = queue.popleft()
-        for other, link, down in neighbours.get(frame, []):
-            if other not in before and other != parent:
-                before[other] = frame, link, down
-                queue.append(other)
-    if child not in before:
-        return None
-    chain, frame = [], child
-    while frame != parent:
-        frame, link, down = before[frame]
-        chain.append((link, down))
-    return chain[::-1]
+    ways: dict[str, _Chain] = {parent: []}
+    frames = deque([parent])
+    while frames:
+        frame = frames.popleft()
+        for upper, lower in links:
+            for here, there, down in ((upper, lower, True), (lower, upper, False)):
+                if here == frame and there not in ways:
+                    ways[there] = [*ways[frame], ((upper, lower), down)]
+                    frames.append(there)
+    return None if parent == child else ways.get(child)
 
 
-def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
+def mount_of(bag: Bag, body: str, sensor: str) -> Mount | None:
     """The mount of a sensor's frame on a robot's; None if the bag does not say. Links that only /tf has are
     taken as they are at first.
 
@@ -196,7 +182,7 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
         return FORWARD
     links: Links = {}
     for name in (STATIC, MOVING):
-        links = read_links(bag, name, clock) | links
+        links = read_links(bag, name) | links
         chains = (_chain_between(links, each, sensor) for each in bodies)
         if (chain := next(filter(None, chains), None)) is not None:
             whole = np.eye(4)
@@ -206,9 +192,7 @@ def mount_of(bag: Bag, body: str, sensor: str, clock: Clock) -> Mount | None:
     return None
 
 
-def poses_between(
-    bag: Bag, frames: tuple[str, str], clock: Clock, report: Report, role: str, plane: str
-) -> Series:
+def _poses_between(bag: Bag, frames: tuple[str, str], role: str, plane: str) -> Series:
     """Poses [M, 3] of a frame in another, at the times of the moving link with most transforms; the other
     moving links are interpolated. A single link may lie in another plane.
 
@@ -216,7 +200,7 @@ def poses_between(
         InputError: the frames do not exist, are not connected or do not move.
     """
     parent, child = (frame.lstrip("/") for frame in frames)
-    links = read_links(bag, MOVING, clock) | read_links(bag, STATIC, clock)
+    links = read_links(bag, MOVING) | read_links(bag, STATIC)
     there = sorted({frame for pair in links for frame in pair})
     for frame in (parent, child):
         if frame not in there:
@@ -231,7 +215,7 @@ def poses_between(
     times, errors = dict[tuple[str, str], np.ndarray](), list[InputError]()
     for pair in moving:
         place = f"{bag.path}, {MOVING} {' to '.join(pair)}"
-        use, faults = usable_stamps([stamp for stamp, *_ in links[pair]], place, clock, report)
+        use, faults = usable_stamps(bag, [stamp for stamp, *_ in links[pair]], place)
         links[pair] = list(compress(links[pair], use))
         times[pair] = in_seconds([stamp for stamp, *_ in links[pair]])
         errors += faults
@@ -240,15 +224,8 @@ def poses_between(
     if errors:
         return Series(where, moments, np.zeros((len(moments), 3)), numbers, errors)
     if len(chain) == 1 and chain[0][1]:
-        given = [
-            (
-                SimpleNamespace(**dict(zip("xyz", shift, strict=True))),
-                SimpleNamespace(**dict(zip("xyzw", turn, strict=True))),
-            )
-            for _, shift, turn, _ in links[lead]
-        ]
-        poses = [pose_in_plane(*pose, where, plane) for pose in given]
-        errors = plane_errors(np.array([shift for _, shift, _, _ in links[lead]]), where, role, plane)
+        poses = [pose_in_plane(shift, turn, where, plane) for _, shift, turn, _ in links[lead]]
+        errors = _plane_errors(np.array([shift for _, shift, _, _ in links[lead]]), where, role, plane)
         return Series(where, moments, np.array(poses).reshape(-1, 3), numbers, errors)
     start, end = max(times[pair][0] for pair in moving), min(times[pair][-1] for pair in moving)
     inside = (start <= moments) & (moments <= end)
@@ -276,3 +253,131 @@ def _matrices(link: Link, time: np.ndarray, moments: np.ndarray, down: bool) -> 
         found[:, :3, :3] = Slerp(time, turns)(moments).as_matrix()
         found[:, :3, 3] = np.column_stack([np.interp(moments, time, axis) for axis in shifts.T])
     return found if down else np.linalg.inv(found)
+
+
+TURNED = 0.5
+"""Typical turn between poses of different frames, rad, from which they disagree."""
+
+
+def read_odometry(bag: Bag, config: OdometryTopic) -> Series:
+    """The odometry: motions [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous sample.
+
+    Raises:
+        InputError: the topic does not exist or has no odometry.
+    """
+    series = read_poses(bag, config, "odometry")
+    time, values, errors = series.time, series.values, series.errors
+    if len(time) < 2 and not errors:
+        errors = [InputError(series.where, "one message with odometry", "at least two")]
+    if errors:
+        return series._replace(values=np.zeros((len(time), 4)), errors=errors)
+    motion = from_velocities(time, *values.T) if series.held else from_poses(time, values)
+    if config.every > 1:
+        chosen = slice(None, None, config.every)
+        path = integrate(motion[:, :3])[chosen]
+        series = series._replace(time=time[chosen], numbers=series.numbers[chosen])
+        motion, values = from_poses(series.time, path), values[chosen]
+    return series._replace(values=motion, poses=None if series.held else values)
+
+
+def read_poses(bag: Bag, config: PoseTopic, role: str = "truth") -> Series:
+    """Poses [M, 3] (x m, y m, heading rad) of a topic or between two frames; of odometry, also velocities.
+
+    Args:
+        role: `truth` or `odometry`.
+
+    Raises:
+        InputError: the topic does not exist or has neither.
+    """
+    if config.tf is not None:
+        series = _poses_between(bag, config.tf, role, config.plane)._replace(body=config.tf[1])
+        return series._replace(errors=series.errors + nonfinite_errors(series.values, role, series.place))
+    assert config.topic is not None
+    known = POSES | TWISTS if role == "odometry" else POSES
+    topic = bag.topic(config.topic, f"recording.topics.{role}", known)
+    where = f"{bag.path}, {topic.name}"
+    wanted_twist = isinstance(config, OdometryTopic) and (config.use == "twist" or topic.kind not in POSES)
+    twist = wanted_twist and topic.kind in TWISTS
+    rows, kept, points, doubts = list[Any](), list[Any](), list[Any](), dict[str, list[str]]()
+    wanted = tuple(frame.lstrip("/") for frame in config.frames)
+
+    def read(content: Any, place: str) -> Any:
+        if wanted != frames_of(content)[: len(wanted)]:
+            return None
+        if twist:
+            value = twist_in_plane(TWISTS[topic.kind](content))
+            if not np.isfinite(value).all():
+                raise InputError(place, f"the velocities are {', '.join(map(str, value))}", "finite numbers")
+            return value
+        position, turn = POSES[topic.kind](content)
+        value = pose_in_plane(position, turn, place, config.plane)
+        points.append(position)
+        found = list[str]()  # doubtful, and can be read
+        if abs(np.hypot(np.hypot(*turn[:2]), np.hypot(*turn[2:])) - 1) > 0.01:
+            found.append("orientations are not unit quaternions (only their direction is used)")
+        covariance = np.asarray(getattr(getattr(content, "pose", None), "covariance", 0.0), float).ravel()
+        if not np.isfinite(covariance).all() or (covariance[::7] < 0).any():
+            found.append("covariances are not numbers or negative: the publisher did not know the pose")
+        for doubt in found:
+            doubts.setdefault(doubt, []).append(place)
+        return value
+
+    for number, time, content, value in bag.usable(topic, read):
+        if value is not None:
+            stamps = (bag.stamp(content, time, each) for each in (bag.clock, OTHER_CLOCK[bag.clock]))
+            rows.append((number, *stamps, frames_of(content), time))
+            kept.append(value)
+    if not rows:
+        raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
+    numbers, times, others, pairs, _ = ([row[k] for row in rows] for k in range(5))
+    values = np.array(kept).reshape(-1, 3)
+    poses = values * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict each other
+    errors = _frame_errors(bag, where, role, rows, poses)
+    for doubt, at in doubts.items() if not errors else ():
+        bag.warn(f"{at[0]}: {len(at)} of {len(rows)} {doubt}; look at the publisher")
+    if not (twist or errors):
+        errors = _plane_errors(np.array(points), where, role, config.plane)
+    series = as_series(bag, where, numbers, times, values, others)
+    errors += series.errors
+    errors += nonfinite_errors(series.values, role, series.place)
+    body = pairs[0][1] or ("" if topic.kind in POSES else pairs[0][0])
+    return series._replace(errors=errors, body=body, held=twist)
+
+
+def _frame_errors(bag: Bag, where: str, role: str, rows: list[Any], poses: np.ndarray) -> list[InputError]:
+    """The error for messages of several frames whose poses [M, 3] disagree; those that agree are told.
+
+    Several nodes that publish in turn make a path longer than that of each; a change of frame jumps or turns.
+    The cure of a single change is the longer part beside it.
+
+    Args:
+        rows: of each message its number, times by both clocks, frames, and time of receipt, ns.
+    """
+    numbers, _, _, frames, received = zip(*rows, strict=True)
+    counts = Counter(frames)
+    if len(counts) < 2:
+        return []
+    usual = counts.most_common(1)[0][0]
+    parts = [f"{' to '.join(filter(None, pair)) or 'no frame'} ({n})" for pair, n in counts.most_common()]
+    found = f"messages of several frames: {', '.join(parts)}"
+    names = np.array([list(counts).index(pair) for pair in frames])
+    changes, places = np.flatnonzero(np.diff(names)), poses[:, :2]
+    at = f"{where}, message {numbers[changes[0] + 1]}"
+    alone = [_length(places[names == k]) for k in range(len(counts))]
+    in_turn = len(changes) > len(counts)
+    turned = np.median(np.abs(wrap(poses[changes + 1, 2] - poses[changes, 2])))
+    # Poses agree up to a path of all frames that is this many times that of each of them.
+    if turned < TURNED and _length(places) <= 1.2 * (max(alone) if in_turn else sum(alone)):
+        bag.warn(f"{at}: {found}; their poses agree, look at the publisher")
+        return []
+    cure = f"--set recording.topics.{role}.frames=[{','.join(filter(None, usual))}]"
+    if len(changes) == 1:
+        end = "to" if frames[0] == usual else "from"
+        middle = float(np.mean(received[changes[0] : changes[0] + 2]))
+        cure = f"--set recording.{end}={bag.since_start(middle):.3f}"
+    found += "; several nodes publish here, or it changes"
+    return [InputError(at, found, "one frame and child frame", cure)]
+
+
+def _length(places: np.ndarray) -> float:
+    return float(np.hypot(*np.diff(places, axis=0).T).sum())

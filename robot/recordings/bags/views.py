@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robot.recordings.alignment import range_errors, range_pixels
-from robot.recordings.bags.bag import Bag, Clock, Report, Series, Topic, as_series, read_usable
+from robot.recordings.bags.bag import Bag, Series, Topic, as_series
 from robot.recordings.bags.topics_config import ViewsTopic
 from robot.recordings.bags.transforms import FORWARD, Mount, mount_of
 from robot.recordings.video import Frame, ImageViewConfig, VisualOdometryConfig, camera_rows
@@ -51,26 +51,24 @@ def grey_image(message: Any, kind: str, where: str) -> np.ndarray:
     Raises:
         InputError: the encoding is unknown, or the data are damaged.
     """
-    return _decoded(message, where) if kind == COMPRESSED else _raw(message, where)
-
-
-def _raw(message: Any, where: str) -> np.ndarray:
+    if kind == COMPRESSED:
+        return _decoded(message, where)
     if message.encoding in ("32FC1", "64FC1"):
         raise InputError(where, f"distances ({message.encoding})", "a grey or colour image", _NO_DEPTH)
     if message.encoding not in _ENCODINGS:
         raise InputError(where, f"encoding {message.encoding!r}", f"one of {', '.join(_ENCODINGS)}")
     number, channels = _ENCODINGS[message.encoding]
-    kind = np.dtype((">" if message.is_bigendian else "<") + number)
+    stored = np.dtype((">" if message.is_bigendian else "<") + number)
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)
-    length = width * len(channels) * kind.itemsize
+    length = width * len(channels) * stored.itemsize
     if not (0 < height * width <= LARGEST and length <= step and len(data) >= step * (height - 1) + length):
         found = f"{width} x {height} pixels of {message.encoding}, {step} bytes a row, in {len(data)} bytes"
         raise InputError(where, found, "data that fit their description")
-    strides = (step, len(channels) * kind.itemsize, kind.itemsize)
-    pixels = np.ndarray((height, width, len(channels)), kind, data.tobytes(), strides=strides)
+    strides = (step, len(channels) * stored.itemsize, stored.itemsize)
+    pixels = np.ndarray((height, width, len(channels)), stored, data.tobytes(), strides=strides)
     if channels == "y":
-        grey = (pixels[..., 0] >> 8).astype(np.uint8) if kind.itemsize == 2 else pixels[..., 0].copy()
+        grey = (pixels[..., 0] >> 8).astype(np.uint8) if stored.itemsize == 2 else pixels[..., 0].copy()
         if not message.encoding.startswith("bayer"):
             return grey
         # Means of each pixel and its right and lower neighbours, one of each colour of the Bayer filter.
@@ -279,16 +277,7 @@ def cloud_points(message: Any, where: str) -> np.ndarray:
     try:
         if height * width * step > len(data):
             raise ValueError("too few")
-        types = {
-            1: "i1",
-            2: "u1",
-            3: "i2",
-            4: "u2",
-            5: "i4",
-            6: "u4",
-            7: "f4",
-            8: "f8",
-        }  # PointField.datatype
+        types = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), 1))  # PointField.datatype
         kinds = [order + types[fields[name].datatype] for name in "xyz"]
         offsets = [fields[name].offset for name in "xyz"]
         kind = np.dtype({"names": list("xyz"), "formats": kinds, "offsets": offsets, "itemsize": step})
@@ -331,8 +320,8 @@ KEY = "recording.topics.views"
 LONGEST = 8.0  # m: of indoor scans, most show something nearer
 
 
-def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, report: Report) -> Series:
-    """Views [M, R, C, 1] of a topic of scans or clouds.
+def read_range_views(bag: Bag, config: ViewsTopic, body: str) -> Series:
+    """Views [M, R, C, 1] of a topic of scans or clouds; for images see `read_image_views`.
 
     Args:
         body: frame of the robot; '' if unknown.
@@ -340,13 +329,10 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
     Raises:
         InputError: the messages are of another type, or do not fit the settings.
     """
-    topic = bag.topic(config.topic, KEY)
+    topic = bag.topic(config.topic, KEY, (SCAN, CLOUD, *IMAGES))
     where = f"{bag.path}, {topic.name}"
-    if topic.kind not in (SCAN, CLOUD):
-        expected = f"one of {', '.join((SCAN, CLOUD, *IMAGES))}"
-        raise InputError(where, f"messages of type {topic.kind}", expected)
-    reader = _RangeReader(bag, topic, config, body, clock)
-    read = list(read_usable(bag, topic, clock, reader.view))
+    reader = _RangeReader(bag, topic, config, body)
+    read = list(bag.stamped(topic, reader.view))
     rows = [row for row in read if row[2] is not None and row[2].covered >= _COVERED]
     empty = sum(view is None for *_, view in read)
     for count, fault in (
@@ -354,13 +340,13 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
         (len(read) - len(rows) - empty, "cover less than half of the sectors"),
     ):
         if count:
-            report(f"{where}: {count} of {topic.total} messages {fault} and are no views")
+            bag.warn(f"{where}: {count} of {topic.total} messages {fault} and are no views")
     if wider := reader.wider_span():
         cure = f"--set {KEY}.span=[{wider[0]:.4f},{wider[1]:.4f}]"
-        report(f"{where}: the scans vary in direction; views have those of the first scan only; {cure}")
+        bag.warn(f"{where}: the scans vary in direction; views have those of the first scan only; {cure}")
     numbers, stamps, found = [row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows]
     pixels = np.array([view.pixels for view in found]).reshape(-1, config.rows, config.columns, 1)
-    series = as_series(where, numbers, stamps, pixels, clock, report)
+    series = as_series(bag, where, numbers, stamps, pixels)
     lowest, typical = np.array([(view.lowest, view.typical) for view in found]).T
     place, key = (lambda row: f"{where}, message {numbers[row]}"), f"{KEY}.max_range"
     reach = reader.reach or LONGEST
@@ -369,12 +355,7 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str, clock: Clock, repo
 
 
 def read_image_views(
-    bag: Bag,
-    topic: Topic,
-    image: ImageViewConfig,
-    visual_odometry: VisualOdometryConfig | None,
-    clock: Clock,
-    report: Report,
+    bag: Bag, topic: Topic, image: ImageViewConfig, visual_odometry: VisualOdometryConfig | None
 ) -> tuple[Series, np.ndarray | None]:
     """Views [M, R, C, 1] of a topic of images, and motions [M, 4] of visual odometry where it is configured;
     one image in memory at a time.
@@ -394,13 +375,13 @@ def read_image_views(
         return grey
 
     def frames() -> Iterator[Frame]:
-        for number, stamp, grey in read_usable(bag, topic, clock, image_of):
+        for number, stamp, grey in bag.stamped(topic, image_of):
             numbers.append(number)
             stamps.append(stamp)
-            yield Frame(stamp / 10**9, grey)
+            yield stamp / 10**9, grey
 
     _, view, motion = camera_rows(frames(), image, visual_odometry, where)
-    views = as_series(where, numbers, stamps, view, clock, report)
+    views = as_series(bag, where, numbers, stamps, view)
     return views, None if motion is None else motion[np.isin(numbers, views.numbers)]
 
 
@@ -411,8 +392,8 @@ class _RangeReader:
         reach: range that becomes 1, m.
     """
 
-    def __init__(self, bag: Bag, topic: Topic, config: ViewsTopic, body: str, clock: Clock) -> None:
-        self._bag, self._topic, self._config, self._body, self._clock = bag, topic, config, body, clock
+    def __init__(self, bag: Bag, topic: Topic, config: ViewsTopic, body: str) -> None:
+        self._bag, self._topic, self._config, self._body = bag, topic, config, body
         self.reach = config.max_range
         self._mounts = dict[str, Mount]()
         self._first = ""  # frame of the first scan
@@ -455,7 +436,7 @@ class _RangeReader:
                 c, s = np.cos(yaw), np.sin(yaw)
                 mount = Mount(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
             elif sensor:
-                mount = mount_of(self._bag, self._body, sensor, self._clock)
+                mount = mount_of(self._bag, self._body, sensor)
             if mount is None:
                 frames = f"from {self._body or 'the robot'} to {sensor or 'the sensor'}"
                 cure = f"the sensor is taken to look ahead (else --set {KEY}.yaw=ANGLE)"

@@ -16,7 +16,7 @@ from evaluation.studies.run_job import run_job
 from evaluation.studies.study import read_study
 from ratslam.mapping.config import FULL
 from ratslam.runs.run import run
-from robot.recordings.mcap_reader import record_source
+from robot.recordings.mcap_writer import record_source
 from robot.recordings.npz_trace import read_trace
 from tactile.base.errors import InputError
 

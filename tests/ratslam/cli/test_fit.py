@@ -12,7 +12,7 @@ from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import dump_data
 from ratslam.service.record_fit import walls_of
 from ratslam.service.rig_fit import Quantity, Rig
-from robot.recordings.mcap_reader import record_source
+from robot.recordings.mcap_writer import record_source
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.odometry import from_motions
 from tactile.base.se2 import integrate

@@ -21,6 +21,7 @@ import yaml
 from evaluation.metrics.trajectory import ate, read_tum
 from ratslam.runs.settings.run_config import load_config
 from robot.recordings.mcap_writer import Recorder
+from robot.sources.source import describe
 from tactile.base.se2 import integrate
 from tests.helpers import scenes
 from tests.helpers.command_worker import CommandWorker, Outcome
@@ -98,7 +99,7 @@ def write_recordings(folder: Path) -> dict[Path, dict[str, Any]]:
         in_flags=np.full(len(step), 3), in_view=views, truth=truth,
         params_json=np.array('{"template_y_size": 3, "template_x_size": 6}'),
     )  # fmt: skip
-    with Recorder(folder / "drive.mcap", rate_hz=2.0, info=scene.info, chunk_s=10.0) as recorder:
+    with Recorder(folder / "drive.mcap", altered(describe(scene), rate_hz=2.0), chunk_s=10.0) as recorder:
         for sample in altered(scene, motion=motion):
             recorder.write(sample)
     columns = {"pose": {}, "views": {}, "truth": {"x": "gx", "y": "gy", "heading": "gh"}}

@@ -10,7 +10,7 @@ from tests.ratslam.cli.run_cases import ROOT, SQUARE, refuses
 
 def test_a_cut_recording_is_recovered_and_run(capsys, tmp_path):
     from robot.recordings.formats import open_recording
-    from robot.recordings.mcap_reader import record_source
+    from robot.recordings.mcap_writer import record_source
     from robot.recordings.recording_config import RecordingConfig
 
     with open_recording(RecordingConfig(file=ROOT / "tests" / "golden" / "a_square3.npz")) as source:

@@ -9,7 +9,7 @@ import numpy as np
 
 from robot.drivers.head.decoder import Frames
 from robot.recordings.cdr import Event
-from robot.recordings.mcap_scanner import McapScanner
+from robot.recordings.mcap_reader import McapScanner
 from robot.sources.source import Sample
 
 SAMPLES = 2000.0

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
-from robot.recordings.mcap_reader import Recording, recover
-from robot.recordings.mcap_scanner import UNCLOSED
+from robot.recordings.mcap_reader import UNCLOSED, Recording
+from robot.recordings.mcap_writer import recover
 from tactile.base.random_streams import stream
 from tests.helpers.live import PATIENCE, until
 from tests.ratslam.live.bench import Bench

@@ -10,7 +10,7 @@ import numpy as np
 from robot.drivers.head.decoder import Cut, Frames, assemble_cycle
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
-from robot.recordings.mcap_scanner import McapScanner, RecordingEntry
+from robot.recordings.mcap_reader import McapScanner, RecordingEntry
 from robot.sources.source import SourceInfo
 from tactile.base.types import Cycle, Odometry
 from tactile.whisker_geometry import HeadConfig

@@ -18,20 +18,8 @@ from hypothesis import strategies as st
 from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames, FrameWindow, assemble_cycle, empty_frames
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
-from robot.recordings.cdr import (
-    TRUTH,
-    Event,
-    decode_cut,
-    decode_event,
-    decode_frames,
-    decode_states,
-    encode_cut,
-    encode_event,
-    encode_frames,
-    encode_states,
-)
-from robot.recordings.mcap_reader import Recording
-from robot.recordings.mcap_scanner import McapScanner
+from robot.recordings.cdr import TRUTH, Event, decode, encode
+from robot.recordings.mcap_reader import McapScanner, Recording
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle
 from tests.robot.live.live_recordings import (
@@ -128,27 +116,30 @@ def test_the_order_of_frames_does_not_matter(tmp_path_factory: Any, data: st.Dat
 @given(st.integers(0, 40), st.integers(0, 5), st.integers(0, 2**32))
 def test_blocks_round_trip(count: int, seed: int, first: int) -> None:
     frames, states = some_frames(count, seed, first), some_states(count + 1, seed)
-    assert same_bits(decode_frames(encode_frames(3.5, frames), W), (3.5, frames))
-    assert encode_frames(3.5, empty_frames(W)) == encode_frames(3.5, rows(frames, slice(0)))
-    at, again = decode_states(encode_states(states))
+    assert same_bits(back(frames), (3.5, frames))
+    assert encode(empty_frames(W), (2, 2, 1), W, 3.5) == encode(rows(frames, slice(0)), (2, 2, 1), W, 3.5)
+    at, again = back(states)
     assert at == states["host"][-1]
     assert again.dtype == ARM_STATE
     assert all((again[name] == states[name]).all() for name in ARM_STATE.names or ())
     cut = Cut.of(count, 1.5, 1.0, frames, motion_of_whisk(seed))
-    assert same_bits(decode_cut(encode_cut(cut)), cut)
+    assert same_bits(back(cut), (1.5, cut))
     assert cut.seen == (count > 0)
     event = Event(0.1, "fault", "ünder: way")
-    assert decode_event(encode_event(event)) == event
+    assert back(event) == (0.1, event)
+
+
+def back(content: Any) -> tuple[float, Any]:
+    """The time and the content, encoded and decoded."""
+    name, _, message = encode(content, (2, 2, 1), W, 3.5)
+    return decode(name, message, (2, 2, 1), W)
 
 
 @given(st.binary(max_size=120), st.sampled_from([0, 1, 2, 3]), st.integers(0, 400), st.integers(0, 2**32 - 1))
 def test_invalid_messages_are_refused(noise: bytes, kind: int, place: int, number: int) -> None:
     frames = some_frames(3)
-    decode: Any = (lambda m: decode_frames(m, W), decode_states, decode_cut, decode_event)[kind]
-    good = (
-        encode_frames(1.0, frames), encode_states(some_states(2)),
-        encode_cut(Cut.of(0, 1.0, 1.0, frames, motion_of_whisk(0))), encode_event(Event(1.0, "a", "b")),
-    )[kind]  # fmt: skip
+    cut = Cut.of(0, 1.0, 1.0, frames, motion_of_whisk(0))
+    name, _, good = encode((frames, some_states(2), cut, Event(1.0, "a", "b"))[kind], (2, 2, 1), W, 1.0)
     place = place % len(good)
     for bad in (
         noise,
@@ -157,11 +148,11 @@ def test_invalid_messages_are_refused(noise: bytes, kind: int, place: int, numbe
         good[:place] + struct.pack("<I", number) + good[place + 4 :],
     ):
         with suppress(ValueError):
-            decode(bad)
+            decode(name, bad, (2, 2, 1), W)
     with pytest.raises(ValueError):
-        decode(good[: max(place, 1) - 1])
+        decode(name, good[: max(place, 1) - 1], (2, 2, 1), W)
     with pytest.raises(ValueError):
-        decode(good + b"\0")
+        decode(name, good + b"\0", (2, 2, 1), W)
 
 
 def test_data_are_written_within_a_fifth_of_a_second(tmp_path: Path) -> None:
@@ -205,7 +196,10 @@ def test_a_cut_without_its_frames_is_an_error(tmp_path: Path, monkeypatch: pytes
     """The recorder is patched to state one frame too many."""
     with monkeypatch.context() as patch, open_recorder(tmp_path / "a.mcap") as recorder:
         patch.setattr(
-            "robot.live.recorder.encode_cut", lambda cut: encode_cut(cut._replace(frames=cut.frames + 1))
+            "robot.recordings.mcap_writer.encode",
+            lambda part, *sizes: encode(
+                part._replace(frames=part.frames + 1) if isinstance(part, Cut) else part, *sizes
+            ),
         )
         frames = some_frames(20)
         recorder.add_whisk(Cut.of(0, START, START, frames, motion_of_whisk(0)), frames)

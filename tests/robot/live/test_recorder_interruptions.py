@@ -16,9 +16,8 @@ import pytest
 
 from robot.drivers.head.decoder import Cut, Frames
 from robot.drivers.outcome import SessionOutcome
-from robot.recordings.mcap_reader import Recording, recover
-from robot.recordings.mcap_scanner import UNCLOSED, McapScanner
-from robot.recordings.mcap_writer import WholeChunkFile
+from robot.recordings.mcap_reader import UNCLOSED, McapScanner, Recording
+from robot.recordings.mcap_writer import WholeChunkFile, recover
 from tests.robot.live.live_recordings import (
     RATE,
     ROOT,

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.recordings.mcap_reader import Recording, recover
-from robot.recordings.mcap_scanner import McapScanner
+from robot.recordings.mcap_reader import McapScanner, Recording
+from robot.recordings.mcap_writer import recover
 from tactile.base.errors import InputError
 from tests.robot.live.live_recordings import START, entries_of, open_recorder, same_bits, session, some_frames
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from robot.recordings.mcap_writer import Recorder
-from robot.sources.source import MazeInfo, Sample, SourceInfo
+from robot.sources.source import MazeInfo, Sample, SourceDescription, SourceInfo
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
 from tactile.calibration import Calibration
 from tactile.whisker_geometry import HeadConfig
 
 SHAPE, WHISKERS = (2, 3, 2), 4
+LIKE = SourceDescription(SHAPE, WHISKERS)
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 """First bytes of a compressed chunk."""
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -122,8 +124,7 @@ def same_bits(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
 
 def write_recording(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
     path.unlink(missing_ok=True)
-    options = {"info": INFO} | options
-    with Recorder(path, view_shape=SHAPE, whiskers=WHISKERS, rate_hz=2.0, **options) as recorder:
+    with Recorder(path, replace(LIKE, rate_hz=2.0, info=INFO), **options) as recorder:
         for sample in samples:
             recorder.write(sample)
     return path

@@ -25,7 +25,7 @@ from robot.recordings.csv_config import (
 )
 from robot.recordings.csv_description import describe_csv
 from robot.recordings.csv_file import read_csv
-from robot.recordings.csv_reader import labels_from_pairs, read_csv_recording
+from robot.recordings.csv_reader import read_csv_recording
 from robot.recordings.input_judge import InputJudge
 from robot.recordings.npz_trace import read_trace
 from robot.sources.in_memory import truncate_log
@@ -122,18 +122,23 @@ def test_labels_from_a_file_and_from_pairs(write: Write) -> None:
     assert [int(sample.reading.label) for sample in samples] == [-1, 0, 0, 1]
 
 
-@given(st.lists(st.tuples(st.integers(0, 8), st.integers(1, 8), st.sampled_from([0.5, 0.75, 0.8, 0.9]))))
-def test_labels_follow_the_best_earlier_match(triples: list[tuple[int, int, float]]) -> None:
-    later = [float(earlier + gap) for earlier, gap, _ in triples]
-    earlier = [float(earlier) for earlier, _, _ in triples]
-    score = [score for *_, score in triples]
-    time, label = labels_from_pairs(later, earlier, score, 0.75)
-    assert time.tolist() == sorted({*later, *earlier})
-    ids = dict(zip(time.tolist(), label.tolist(), strict=True))
+PAIRS = st.tuples(st.integers(0, 8), st.integers(1, 8), st.sampled_from([0.5, 0.75, 0.8, 0.9]))
+
+
+@given(st.lists(PAIRS, min_size=1))
+def test_labels_follow_the_best_earlier_match(
+    tmp_path_factory: pytest.TempPathFactory, triples: list[tuple[int, int, float]]
+) -> None:
+    odometry, pairs = (tmp_path_factory.getbasetemp() / name for name in ("o.csv", "pairs.csv"))
+    odometry.write_text("t,vx,w\n" + "".join(f"{t},0.1,0\n" for t in range(17)))
+    lines = [f"{earlier + gap},{earlier},{score}\n" for earlier, gap, score in triples]
+    pairs.write_text("t1,t2,score\n" + "".join(lines))
+    source = read_csv_recording(odometry, with_parts(pairs=PairColumns(file=pairs)))
+    ids = {int(sample.time): int(sample.reading.label) for sample in source if sample.reading.label >= 0}
+    assert ids.keys() == {t for earlier, gap, _ in triples for t in (earlier, earlier + gap)}
     new = 0
-    for moment in time.tolist():
-        matches = [(s, -i, e) for i, (t, e, s) in enumerate(zip(later, earlier, score, strict=True))
-                   if t == moment and s >= 0.75]  # fmt: skip
+    for moment in ids:
+        matches = [(s, -i, e) for i, (e, gap, s) in enumerate(triples) if e + gap == moment and s >= 0.75]
         assert ids[moment] == (ids[max(matches)[2]] if matches else new)
         new += not matches
 

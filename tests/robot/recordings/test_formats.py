@@ -24,7 +24,7 @@ from robot.recordings.csv_config import (
     ViewColumns,
 )
 from robot.recordings.formats import FORMATS, open_recording
-from robot.recordings.mcap_reader import record_source
+from robot.recordings.mcap_writer import record_source
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.input_files import read_bytes
 from robot.sources.source import SOURCES, Source, SourceEntry

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.recordings.cdr import OBSERVATION, SCHEMAS, TOPICS
-from robot.recordings.mcap_reader import Recording, record_source, recover
-from robot.recordings.mcap_scanner import FORMAT, McapScanner, metadata_checksum
-from robot.recordings.mcap_writer import Recorder
+from robot.recordings.mcap_reader import FORMAT, McapScanner, Recording, metadata_checksum
+from robot.recordings.mcap_writer import Recorder, record_source, recover
 from robot.recordings.npz_trace import read_trace
 from robot.sources.source import Sample, Source, SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.types import Observation, Odometry, observation
 from tests.robot.recordings.mcap_samples import (
     INFO,
+    LIKE,
     SAMPLES,
     SHAPE,
     WHISKERS,
@@ -87,8 +88,8 @@ def test_existing_files_are_not_overwritten(
     path.write_bytes(small[0])
     old.write_bytes(b"precious")
     refused(lambda: recover(path, old), str(old), "exists already", "another")
-    refused(lambda: Recorder(old), str(old), "exists already", "another")
-    refused(lambda: Recorder(tmp_path / "no" / "folder.mcap"), "cannot be written")
+    refused(lambda: Recorder(old, LIKE), str(old), "exists already", "another")
+    refused(lambda: Recorder(tmp_path / "no" / "folder.mcap", LIKE), "cannot be written")
     assert old.read_bytes() == b"precious"
 
 
@@ -110,7 +111,7 @@ def test_a_file_of_another_format_is_refused(tmp_path: Path, refused: Callable[.
     refused(
         lambda: Recording(path), str(path), "has no ratslam metadata", "written by this version of ratslam"
     )
-    Recorder(tmp_path / "none.mcap").close()
+    Recorder(tmp_path / "none.mcap", LIKE).close()
     refused(lambda: Recording(tmp_path / "none.mcap"), "holds no samples", "at least one sample")
 
 
@@ -127,7 +128,7 @@ def test_a_recorder_refuses_wrong_shapes_and_values(
         "contact: int64 values; expected values that bool holds": {"contact": np.array([0, 1, 2, 0])},
         "alive: shape [3]; expected [4]": {"alive": np.ones(3, bool)},
     }
-    with Recorder(path, view_shape=SHAPE, whiskers=WHISKERS) as recorder:
+    with Recorder(path, LIKE) as recorder:
         for piece, change in wrong.items():
             bad = good._replace(reading=good.reading._replace(**change))
             refused(lambda bad=bad: recorder.write(bad), piece)
@@ -224,7 +225,7 @@ def test_a_recording_of_another_version_is_refused(
 ) -> None:
     old = tmp_path / "old.mcap"
     with monkeypatch.context() as patch:
-        patch.setattr("robot.recordings.mcap_scanner.FORMAT", "2")
+        patch.setattr("robot.recordings.mcap_reader.FORMAT", "2")
         write_recording(old, some_samples(3))
     refused(lambda: Recording(old), str(old), "its format is '2', this version reads '3'")
     other = tmp_path / "other.mcap"
@@ -237,7 +238,7 @@ def test_a_recording_of_another_version_is_refused(
 @pytest.mark.parametrize("value", [np.nan, object(), np.zeros(2)])
 def test_provenance_that_is_not_json_is_refused_before_a_file_is_written(tmp_path: Path, value: Any) -> None:
     with pytest.raises((ValueError, TypeError)):
-        Recorder(tmp_path / "a.mcap", info=SourceInfo(provenance={"a": value}))
+        Recorder(tmp_path / "a.mcap", replace(LIKE, info=SourceInfo(provenance={"a": value})))
     assert not (tmp_path / "a.mcap").exists()
 
 

@@ -110,9 +110,9 @@ def test_a_killed_recorder_loses_no_more_than_its_last_half_second(tmp_path: Pat
         import os, signal
         from pathlib import Path
         from robot.recordings.mcap_writer import Recorder
-        from robot.sources.source import Sample
+        from robot.sources.source import Sample, SourceDescription
         from tactile.base.types import Odometry, observation
-        recorder = Recorder(Path({str(path)!r}))
+        recorder = Recorder(Path({str(path)!r}), SourceDescription((3, 6, 1)))
         for i in range(25):
             recorder.write(Sample(0.1 * i, observation(Odometry(0.01, 0, 0, 0.1)), None))
         os.kill(os.getpid(), signal.SIGKILL)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robot.recordings.mcap_reader import Recording, record_source
+from robot.recordings.mcap_reader import Recording
+from robot.recordings.mcap_writer import record_source
 from robot.recordings.npz_trace import read_trace
 from robot.sources.source import Source
 from tactile.base.errors import InputError, InputErrors

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robot.recordings.formats import open_recording
-from robot.recordings.mcap_reader import record_source
+from robot.recordings.mcap_writer import record_source
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.in_memory import load_into_memory

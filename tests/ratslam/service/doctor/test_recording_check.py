@@ -17,7 +17,7 @@ from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import dump_data, parse, validate
 from ratslam.service.recording_check import diagnose_recording
-from robot.recordings.mcap_reader import record_source
+from robot.recordings.mcap_writer import record_source
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from tactile.base.errors import InputError
 from tests.helpers.corridor_camera import Camera, CorridorLoop, write_video

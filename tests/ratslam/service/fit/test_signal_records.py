@@ -11,7 +11,7 @@ from ratslam.cli import main
 from ratslam.runs.settings.run_config import load_config
 from ratslam.service.record_fit import fit_record
 from ratslam.service.rig_fit import Rig
-from robot.recordings.mcap_reader import record_source
+from robot.recordings.mcap_writer import record_source
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from tactile.whisker_geometry import HeadConfig
 

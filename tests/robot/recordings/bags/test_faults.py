@@ -14,8 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import IndexType, Writer
 
 from ratslam.__main__ import main
-from robot.recordings.bags.bag_description import describe_bag
-from robot.recordings.bags.topic_suggestion import suggested_topics
+from robot.recordings.bags.bag_description import describe_bag, suggested_topics
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.source import Source

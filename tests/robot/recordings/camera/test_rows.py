@@ -32,9 +32,7 @@ def texture(width: int = 320, height: int = 24, seed: int = 0) -> np.ndarray:
 def turning(shifts: list[int], step: float = 0.1) -> list[Frame]:
     """Frames of a panorama that turns by columns."""
     image = texture()
-    return [
-        Frame(step * i, np.roll(image, total, axis=1)) for i, total in enumerate(np.cumsum(shifts).tolist())
-    ]
+    return [(step * i, np.roll(image, total, axis=1)) for i, total in enumerate(np.cumsum(shifts).tolist())]
 
 
 @given(st.integers(1, 7), st.integers(1, 9), st.integers(0, 3), st.integers(0, 5))
@@ -66,8 +64,8 @@ def test_a_panorama_turns_by_whole_columns_exactly() -> None:
 
 def test_turns_are_found_between_columns() -> None:
     coarse = [
-        Frame(f.time, f.grey.reshape(24, 80, 4).mean(axis=2).round().astype(np.uint8))
-        for f in turning([0, 1, 2, 5])
+        (time, grey.reshape(24, 80, 4).mean(axis=2).round().astype(np.uint8))
+        for time, grey in turning([0, 1, 2, 5])
     ]
     _, _, motion = camera_rows(coarse, VIEW, PANORAMA, "turn")
     assert motion is not None
@@ -76,7 +74,7 @@ def test_turns_are_found_between_columns() -> None:
 
 
 def test_a_camera_with_edges_turns_by_its_field_of_view() -> None:
-    frames = [Frame(f.time, f.grey[:, :200]) for f in turning([0, 4, 4, -6])]
+    frames = [(time, grey[:, :200]) for time, grey in turning([0, 4, 4, -6])]
     _, _, motion = camera_rows(frames, VIEW, NARROW, "turn")
     assert motion is not None
     np.testing.assert_allclose(np.rad2deg(motion[:, 2]), np.array([0, 4, 4, -6]) * 60 / 200, atol=0.01)
@@ -85,7 +83,7 @@ def test_a_camera_with_edges_turns_by_its_field_of_view() -> None:
 @pytest.mark.parametrize("gain", [0.3, 0.6])
 def test_exposure_cancels_out(gain: float) -> None:
     frames = turning([0, 4, 4])
-    dark = [Frame(f.time, np.round(f.grey * gain).astype(np.uint8)) for f in frames]
+    dark = [(time, np.round(grey * gain).astype(np.uint8)) for time, grey in frames]
     full, less = (camera_rows(part, VIEW, PANORAMA, "turn")[2] for part in (frames, dark))
     assert full is not None
     assert less is not None
@@ -96,8 +94,7 @@ def test_the_first_frame_is_silent_and_steps_follow_the_stamps() -> None:
     random = np.random.default_rng(3)
     noise = [random.integers(0, 256, (24, 320), dtype=np.uint8) for _ in range(3)]
     config = VisualOdometryConfig(fov_deg=60, max_speed=0.01)  # the limit counts here: distance is 0.01 dt
-    frames = [Frame(time, grey) for time, grey in zip((5.0, 5.1, 5.4), noise, strict=True)]
-    motion = camera_rows(frames, VIEW, config, "noise")[2]
+    motion = camera_rows(zip((5.0, 5.1, 5.4), noise, strict=True), VIEW, config, "noise")[2]
     assert motion is not None
     assert (motion[0] == 0).all()
     np.testing.assert_allclose(np.hypot(motion[:, 0], motion[:, 1]), [0, 0.001, 0.003], rtol=1e-9)
@@ -112,7 +109,7 @@ def test_turns_beyond_the_largest_rate_are_not_looked_for() -> None:
 
 
 def test_black_frames_and_repeated_stamps_move_nothing() -> None:
-    frames = [Frame(time, np.zeros((24, 32), np.uint8)) for time in (0.0, 0.1, 0.1)]
+    frames = [(time, np.zeros((24, 32), np.uint8)) for time in (0.0, 0.1, 0.1)]
     motion = camera_rows(frames, VIEW, NARROW, "night")[2]
     assert motion is not None
     assert np.isfinite(motion).all()
@@ -130,7 +127,7 @@ def test_frames_are_not_kept() -> None:
             alive.append(weakref.ref(grey))
             gc.collect()
             most = max(most, sum(reference() is not None for reference in alive))
-            yield Frame(0.1 * i, grey)
+            yield 0.1 * i, grey
 
     gc.freeze()  # so that a collection goes through the frames alone
     try:
@@ -152,7 +149,7 @@ FAULTS = {
 @pytest.mark.parametrize("case", FAULTS)
 def test_faulty_frames_are_refused(case: str) -> None:
     shapes, settings, expected = FAULTS[case]
-    frames = [Frame(float(i), np.zeros(shape, np.uint8)) for i, shape in enumerate(shapes)]
+    frames = [(float(i), np.zeros(shape, np.uint8)) for i, shape in enumerate(shapes)]
     with pytest.raises(InputError, match=expected):
         camera_rows(frames, VIEW.model_copy(update=settings), None, "frames")
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from robot.recordings.mcap_reader import Recording, record_source
+from robot.recordings.mcap_reader import Recording
+from robot.recordings.mcap_writer import record_source
 from robot.sources.in_memory import load_into_memory
 from robot.touch_source import head_config_of, open_touch_source
 from tactile.base.errors import InputError
