@@ -382,8 +382,9 @@ def _timed_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
     from evaluation.studies.machine import one_core
 
     with one_core():
+        from evaluation.papers.tables.batches import batch_table
         from evaluation.papers.tables.cycles import cycle_table, profile_table
-        from evaluation.papers.tables.speed import SIZES, batch_table, speed_table
+        from evaluation.papers.tables.speed import SIZES, speed_table
 
         if name == "speed":
             yield from speed_table(arguments.rows or SIZES, arguments.rounds)
