@@ -22,7 +22,6 @@ from ratslam.methods.recall import RecallBackend
 from ratslam.network.pose_cells import Belief
 from ratslam.places.localiser import Localiser, Place
 from ratslam.places.map_views import MapViews
-from ratslam.recall import memory as recall_memory
 from ratslam.recall.memory import Memory
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
@@ -110,10 +109,9 @@ class LocaliseBackend(Backend):
         recall = self._recall
         odometry, view, visible, clean = finite_values(recall.dtype, observation)
         seen, view = recall.prepare(observation, view, visible)
-        memory = recall_memory.accumulate_motion(
-            state.memory, jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
-        )
-        due = recall_memory.is_motion_due(self._views.config, recall.cell, memory) | (state.seen == 0)
+        moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
+        memory = state.memory.accumulate_motion(moved)
+        due = memory.is_motion_due(self._views.config, recall.cell) | (state.seen == 0)
         is_keyframe = seen & due
         features = recall.features(view, observation)
 
