@@ -124,9 +124,9 @@ def _transfer(source: Level, block: Block, target: Level, origin: Array) -> Bloc
     ring = source.window.ring_sizes()[::-1]
 
     def cut(cells: Array, first: Array) -> Array:
-        for k, axis in enumerate(target.window.axes):
+        for k, wanted in enumerate(target.window.shape):
             size = source.window.shape[k]
-            at = (origin[2 - k] - first[2 - k] + np.arange(axis.size, dtype=np.int32)) % ring[k]
+            at = (origin[2 - k] - first[2 - k] + np.arange(wanted, dtype=np.int32)) % ring[k]
             part = jnp.take(cells, jnp.minimum(at, size - 1), axis=k)
             cells = jnp.where((at < size).reshape([-1 if a == k else 1 for a in range(3)]), part, 0.0)
         return cells
@@ -139,10 +139,10 @@ def _extent(shape: Window, block: Block) -> tuple[Array, Array, Array]:
     """[3] first and last cells with activity over x, y, heading of one window, and bool: there are any."""
     cells, dtype = block.activity > 0, block.activity.dtype
     low, high = [], []
-    for k, axis in zip((2, 1, 0), shape.axes[::-1], strict=True):
+    for k in (2, 1, 0):
         among = jnp.any(cells, axis=tuple(a for a in range(3) if a != k))
         low.append(jnp.argmax(among))
-        high.append(axis.size - 1 - jnp.argmax(among[::-1]))
+        high.append(shape.shape[k] - 1 - jnp.argmax(among[::-1]))
     first = block.origin.astype(dtype)
     return first + jnp.stack(low).astype(dtype), first + jnp.stack(high).astype(dtype), jnp.any(cells)
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from ratslam.grid.config import GridConfig
 from ratslam.grid.map import ContactLog
+from ratslam.grid.particles import placed
 from tactile.base.se2 import compose
 from tactile.base.types import Array
 from tactile.whisker_geometry import PlanarWhiskers
@@ -211,7 +212,7 @@ class Expectation:
     def whisker_classes(self, pose: Array) -> Array:
         """[N, W] class of each whisker at poses [N, 3]."""
         dtype = pose.dtype
-        cell, inside = self._cells(_placed(pose, jnp.asarray(self.base, dtype)))
+        cell, inside = self._cells(placed(pose, jnp.asarray(self.base, dtype)))
         turned = (pose[:, 2:] + jnp.asarray(self.angle, dtype)[None]) * (HEADINGS / (2 * np.pi))
         heading = jnp.round(turned).astype(jnp.int32) % HEADINGS
         index = heading * self.side**2 + cell
@@ -225,7 +226,7 @@ class Expectation:
 
     def wall_classes(self, pose: Array, place: Array, direction: Array) -> Array:
         """[N] class of a wall at `place` [2] of base_link, with its direction there, at poses [N, 3]."""
-        cell, inside = self._cells(_placed(pose, place[None])[:, 0])
+        cell, inside = self._cells(placed(pose, place[None])[:, 0])
         cosine, sine = jnp.asarray(self.direction, pose.dtype)[:, cell]
         off = 2 * (pose[:, 2] + direction) - jnp.arctan2(sine, cosine)
         off = jnp.abs(off - 2 * np.pi * jnp.round(off / (2 * np.pi))) / 2
@@ -239,10 +240,3 @@ class Expectation:
         inside = jnp.all((at >= 0) & (at < self.side), axis=-1)
         at = jnp.where(inside[..., None], at, 0.0).astype(jnp.int32)
         return at[..., 1] * self.side + at[..., 0], inside
-
-
-def _placed(pose: Array, points: Array) -> Array:
-    """[N, K, 2] points [K, 2] of base_link at poses [N, 3]."""
-    c, s = jnp.cos(pose[:, 2:]), jnp.sin(pose[:, 2:])
-    right, up = points[None, :, 0], points[None, :, 1]
-    return jnp.stack([pose[:, :1] + c * right - s * up, pose[:, 1:2] + s * right + c * up], axis=-1)
