@@ -143,15 +143,16 @@ def _diff(arguments: argparse.Namespace) -> int:
 def _undo(arguments: argparse.Namespace) -> int:
     output: Path | None = arguments.output
     prepare_jax()
-    from ratslam.runs.map_care import finish_undo, replaced_file, undo_sequence
+    from ratslam.runs.folder_change import finish_change
+    from ratslam.runs.map_care import replaced_file, undo_sequence
 
     if output is None:
         output = arguments.map = replaced_file(arguments.map)
-        finished = finish_undo(output)
+        finished = finish_change(output.parent)
         if finished is not None:
             folder = output.parent
             print(f"{folder}: the undo of sequence {finished}, which had been cut off, is complete")
-        if finished == arguments.sequence:
+        if finished == str(arguments.sequence):
             return 0
     saved = _read(arguments.map)
     rewritten = undo_sequence(saved, arguments.sequence, output)
@@ -258,10 +259,10 @@ def add_merge(commands: Commands) -> None:
 
 def _merge(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from ratslam.runs.merge import merge_maps
+    from ratslam.runs.merge import describe_merge, merge_maps
 
     report = merge_maps(arguments.maps, arguments.output, tell)
-    print(json.dumps(report.to_json(), indent=2) if arguments.json else report.describe())
+    print(json.dumps(report, indent=2) if arguments.json else describe_merge(report))
     return 0
 
 

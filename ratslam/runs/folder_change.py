@@ -92,12 +92,14 @@ def _read_record(folder: Path) -> dict[str, Any]:
     return read_json(folder / READY / RECORD, "the record of a change of this folder", parse)
 
 
-def finish_change(folder: Path) -> None:
-    """Puts the files of such a change in place."""
-    folder = folder.resolve()
-    with _alone(folder):
-        if unfinished_change(folder) is not None:
-            _put_in_place(folder)
+def finish_change(folder: Path) -> str | None:
+    """Puts the files of such a change in place; returns its name, None without one."""
+    what, folder = unfinished_change(folder), folder.resolve()
+    if what is not None:
+        with _alone(folder):
+            if unfinished_change(folder) is not None:
+                _put_in_place(folder)
+    return what
 
 
 def _put_in_place(folder: Path) -> None:
