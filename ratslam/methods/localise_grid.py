@@ -99,8 +99,8 @@ class GridLocaliseBackend(Backend):
         surfaces = draw_surfaces(config, made.feelers, made.side, path, made.contacts())
         free = surfaces.centres()[surfaces.evidence < DRIVEN]
         if not len(free):
-            expected = "one in which a session can be found"
-            raise InputError("localise.map", "a map without driven ground", expected)
+            found = "a map without driven ground"
+            raise InputError("localise.map", found, "one in which a session can be found")
         expected = Expectation(surfaces, made.feelers, config.body)
         self._search = Search(config, expected, free, count, self.dtype)
         self._needed = log_odds + float(np.log(self._search.places())) + ALIKE

@@ -192,7 +192,8 @@ def _packets(study: StudyCourse) -> np.ndarray:
     network = study.config.excite_sigma, study.config.inhibit_sigma, study.config.global_inhibition, 1.0
     speed, heading = np.array(LEVELS).T
     # `CellSets` scales the noise of a step; over a step the white noise of a second is larger.
-    sets = CellSets(*(np.full(count, each) for each in network), speed * np.sqrt(RATE), heading)
+    columns = [*(np.full(count, each) for each in network), speed * np.sqrt(RATE), heading]
+    sets = CellSets(*columns)
     tracks = walk(study.config, sets, study.course, study.chosen)
     wrapped = np.concatenate([track.pose for track in tracks], axis=1)
     start = np.broadcast_to(ring // 2, (count, 1, 3))
