@@ -82,7 +82,8 @@ def draw_surfaces(
         place = compose(path[k], np.array([*log.point[k, whisker], 0.0]))
         rows, off = _near(centres, place, FAR * BLOB * config.footprint.blob_sd)
         met[rows] += np.exp(-(off**2).sum(axis=-1) / (2 * (BLOB * config.footprint.blob_sd) ** 2))
-    for place in _walls(path, log):
+    for k, (foot, normal) in log.walls().items():
+        place = compose(path[k], np.array([*foot, normal + np.pi / 2]))
         along, across = ALONG * config.footprint.along, ACROSS * config.footprint.across
         rows, off = _near(centres, place, FAR * along)
         c, s = np.cos(place[2]), np.sin(place[2])
@@ -94,19 +95,6 @@ def draw_surfaces(
     passed, driven = _free(config, whiskers, made, path, log)
     evidence = MET * met - PASSED * np.minimum(passed, MOST_PASSED) - DRIVEN * np.minimum(driven, MOST_DRIVEN)
     return made._replace(evidence=np.clip(evidence, -MOST, MOST))
-
-
-def _walls(path: np.ndarray, log: ContactLog) -> list[np.ndarray]:
-    """Places and directions [3] of the walls of the reports in the map."""
-    found = []
-    distance = np.hypot(*log.wall.T)
-    for k in np.flatnonzero((distance > 1e-6) & log.valid & log.contact.any(axis=1)).tolist():
-        normal = log.wall[k] / distance[k]
-        middle = log.point[k][log.contact[k]].mean(axis=0)
-        foot = middle + normal * (distance[k] - normal @ middle)
-        direction = np.arctan2(normal[1], normal[0]) + np.pi / 2
-        found.append(compose(path[k], np.array([*foot, direction])))
-    return found
 
 
 def _free(

@@ -94,18 +94,11 @@ class GridBackend(Backend):
 
     Args:
         feelers: whisker geometry of the observations. side: of the map, m. dtype: of all floating state.
-        counted: selects the free points that count in eq. 2 (`likelihood.model: literal`).
     """
 
     def __init__(
-        self,
-        config: GridConfig,
-        feelers: PlanarWhiskers,
-        side: float,
-        dtype: Any = np.float64,
-        counted: likelihoods.CountedCells = likelihoods.all_cells,
+        self, config: GridConfig, feelers: PlanarWhiskers, side: float, dtype: Any = np.float64
     ) -> None:
-        self.counted = counted
         self.config, self.feelers, self.dtype = config, feelers, np.dtype(dtype)
         self.side = int(np.ceil(side / config.cell))
         self.whiskers = len(feelers.length)
@@ -164,6 +157,16 @@ class GridBackend(Backend):
         after = GridState(swarm, maps, wall_directions, motion, touched, jax.random.key_data(key))
         return after, estimate, evidence
 
+    def counted(self, cell: Array, contact: Array) -> Array:
+        """The free points that count in eq. 2 (`likelihood.model: literal`): as printed every point, also the
+        tip of a whisker in contact.
+
+        Args:
+            cell: [N, W, G, 2] cells at the points of each whisker, from base to tip. contact: [W] bool.
+        """
+        del contact
+        return jnp.ones(cell.shape[:-1], bool)
+
     def new_map(self) -> GridMap:
         """An empty map."""
         return GridMap(self.config, self.feelers, self.side)
@@ -174,10 +177,11 @@ class GridBackend(Backend):
             cell = jnp.round(self._in_cells(pose, jnp.asarray(self.shafts)))
             evidence = particles.interpolate(state.maps, EVIDENCE, cell)
             shape = (len(pose), self.whiskers, SEGMENTS)
+            reporting = features.free | features.touching
+            among = self.counted(cell.reshape(*shape, 2), features.touching) & reporting[None, :, None]
             likelihood = likelihoods.printed_likelihood(
-                self.config.prior, evidence.reshape(shape), cell.reshape(*shape, 2),
-                features.touching, features.free | features.touching, self.counted,
-            )  # fmt: skip
+                self.config.prior, evidence.reshape(shape), features.touching, among
+            )
             return jnp.where(features.valid, likelihood, 0.0)
         points = jnp.concatenate([jnp.asarray(self.free), jnp.asarray(self.body)])
         evidence = particles.interpolate(state.maps, EVIDENCE, self._in_cells(pose, points))
