@@ -70,19 +70,16 @@ def window_levels(config: NetworkConfig, dtype: np.dtype) -> tuple[Level, ...]:
     return (*(level for level in lower if level.windows * np.prod(level.window.shape) <= most), torus)
 
 
-def _empty_block(level: Level, dtype: np.dtype) -> Block:
-    """A block without activity."""
-    shape = (level.windows, *level.window.shape)
-    return Block(jnp.zeros(shape, dtype), jnp.zeros((level.windows, 3), jnp.int32))
-
-
 def point_activity(levels: tuple[Level, ...], pose: Array) -> Activity:
     """Unit activity at a pose [3], shared among its neighbour cells, at the smallest level."""
     smallest, dtype = levels[0].window, pose.dtype
     origin = smallest.origin_centred_on(pose)
     cells = smallest.deposit(jnp.zeros(smallest.shape, dtype), origin, pose, jnp.ones((), dtype))
-    above = tuple(_empty_block(level, dtype) for level in levels[1:])
-    return Activity((Block(cells[None], origin[None]), *above), jnp.int32(0))
+    blocks = [Block(cells[None], origin[None])]
+    for level in levels[1:]:
+        empty = jnp.zeros((level.windows, *level.window.shape), dtype)
+        blocks.append(Block(empty, jnp.zeros((level.windows, 3), jnp.int32)))
+    return Activity(tuple(blocks), jnp.int32(0))
 
 
 def to_full_torus(levels: tuple[Level, ...], activity: Activity) -> Array:

@@ -217,14 +217,11 @@ class CellSums:
         """The place bin (row by row) and the heading bin of a true pose, None outside."""
         if not np.isfinite(truth).all():
             return None
-        column, row = _bin(self._x_edges, truth[0]), _bin(self._y_edges, truth[1])
-        if column is None or row is None:
-            return None
+        at = []
+        for edges, value in ((self._x_edges, truth[0]), (self._y_edges, truth[1])):
+            if not edges[0] <= value <= edges[-1]:
+                return None
+            # The last bin holds its upper edge.
+            at.append(min(int(np.searchsorted(edges, value, side="right")), len(edges) - 1) - 1)
+        column, row = at
         return row * self._width + column, round(float(truth[2]) / (2 * np.pi) * self._turns) % self._turns
-
-
-def _bin(edges: np.ndarray, value: float) -> int | None:
-    """The bin between edges [n + 1] that holds a value, None outside; the last one holds its upper edge."""
-    if not edges[0] <= value <= edges[-1]:
-        return None
-    return min(int(np.searchsorted(edges, value, side="right")), len(edges) - 1) - 1

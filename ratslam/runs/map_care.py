@@ -21,8 +21,8 @@ from ratslam.places.crop import crop_map
 from ratslam.places.difference import MapContent, difference, keyframe_content
 from ratslam.runs.folder_change import change_folder
 from ratslam.runs.map_results import rewrite_results
+from ratslam.runs.map_settings import flat_settings
 from ratslam.runs.saved_map import NAME, SavedMap, map_file, write_map
-from ratslam.runs.settings.changed_settings import flat_settings
 from ratslam.runs.settings.strict_yaml import dump
 from tactile.base.bounded import malformed
 from tactile.base.errors import InputError

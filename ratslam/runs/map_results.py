@@ -31,9 +31,8 @@ from evaluation.report import PAGE_START
 from evaluation.report.page import check_report_libraries, write_page
 from evaluation.report.run_report import read_run_report
 from ratslam.core.backend import Map
-from ratslam.runs.settings.changed_settings import changed_settings
 from ratslam.runs.settings.packaged import read_citation
-from ratslam.runs.settings.run_config import ScoreConfig
+from ratslam.runs.settings.run_config import ScoreConfig, changed_settings
 from tactile.base.errors import InputError
 from tactile.base.files import require_new_file, write_atomically, write_text_atomically
 
