@@ -163,9 +163,12 @@ def _undo(arguments: argparse.Namespace) -> int:
 
 
 def _crop(arguments: argparse.Namespace) -> int:
+    prepare_jax()
+    from ratslam.places.crop import keyframes_in_box, keyframes_of_piece, keyframes_of_steps
+    from ratslam.runs.map_care import Choose, crop_saved
+
     box, steps = arguments.box, arguments.steps
-    x0 = y0 = x1 = y1 = 0.0
-    first = last = ""
+    choose: Choose = partial(keyframes_of_piece, piece=arguments.piece)
     if box is not None:
         try:
             x0, y0, x1, y1 = (float(part) for part in box.split(","))
@@ -173,22 +176,13 @@ def _crop(arguments: argparse.Namespace) -> int:
             raise InputError("--box", repr(box), "four numbers X0,Y0,X1,Y1, m") from None
         if not (x0 < x1 and y0 < y1):  # nor with NaN
             raise InputError("--box", repr(box), "X0 < X1 and Y0 < Y1, m")
+        choose = partial(keyframes_in_box, box=(x0, y0, x1, y1))
     if steps is not None:
         first, colon, last = steps.partition(":")
         if not colon or not all(part.isdecimal() or not part for part in (first, last)):
             raise InputError("--steps", repr(steps), "A:B with whole numbers from 0")
+        choose = partial(keyframes_of_steps, first=int(first or 0), last=int(last or sys.maxsize))
     saved = _read(arguments.map)
-    from ratslam.places.crop import keyframes_in_box, keyframes_of_piece, keyframes_of_steps
-    from ratslam.runs.map_care import Choose, crop_saved
-
-    choose: Choose
-    if box is not None:
-        choose = partial(keyframes_in_box, box=(x0, y0, x1, y1))
-    elif steps is not None:
-        end = int(last) if last else sys.maxsize
-        choose = partial(keyframes_of_steps, first=int(first or 0), last=end)
-    else:
-        choose = partial(keyframes_of_piece, piece=arguments.piece)
     count = crop_saved(saved, choose, arguments.output)
     print(f"{arguments.output}: {count} of {saved.steps} steps")
     return 0

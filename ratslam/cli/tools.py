@@ -131,23 +131,19 @@ def add_check(commands: Commands) -> None:
         "check", None, "check a backend, source, touch front end or metric", "check backend recall", "files"
     )
     kinds = Commands(check)
-    backend = kinds.add("backend", partial(_check, "backend"), "check a SLAM method", "check backend recall")
-    source = kinds.add(
-        "source", partial(_check, "source"), "check a source or recording format", "check source my_robot"
-    )
-    touch = kinds.add(
-        "touch",
-        partial(_check, "touch"),
-        "check a touch front end",
-        "check touch my_taxels --source my_array",
-    )
-    metric = kinds.add("metric", partial(_check, "metric"), "check a metric", "check metric my_error")
-    for parser in (backend, source, touch, metric):
+    for kind, what, example in (
+        ("backend", "a SLAM method", "recall"),
+        ("source", "a source or recording format", "my_robot"),
+        ("touch", "a touch front end", "my_taxels --source my_array"),
+        ("metric", "a metric", "my_error"),
+    ):
+        parser = kinds.add(kind, partial(_check, kind), f"check {what}", f"check {kind} {example}")
         parser.add_argument("name", metavar="NAME", help="name under which it is registered")
         parser.add_argument(
             "--set", action="append", default=[], metavar="settings.a=value",
             help="replace a setting of it; may be repeated",
         )  # fmt: skip
+    source, touch = kinds.parsers["source"], kinds.parsers["touch"]
     source.add_argument(
         "--touch", metavar="NAME",
         help="front end for readings that are not observations; its settings by --set touch.a=value",
