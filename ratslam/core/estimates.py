@@ -107,6 +107,17 @@ class LocalisedPose(NamedTuple):
     mass: float
     log_odds: float
 
+    def complete(self, estimate: Estimate) -> Estimate:
+        """The estimate of a backend with this pose instead of its own."""
+        dtype = np.asarray(estimate.pose).dtype
+        return estimate._replace(
+            pose=self.pose.astype(dtype),
+            spread=np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).astype(dtype),
+            lost=np.bool_(self.state != Localisation.FOUND),
+            action=np.int32(Action.NONE),
+            place=np.int32(-1),
+        )
+
 
 class LocalisedCourse(Checkpointed):
     """The states and poses of all steps of a session."""

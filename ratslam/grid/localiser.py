@@ -23,7 +23,6 @@ from jax import lax
 from ratslam.core.arrays import Checkpointed
 from ratslam.core.backend import Map
 from ratslam.core.estimates import (
-    Action,
     Estimate,
     GridDrawing,
     Localisation,
@@ -111,14 +110,7 @@ class GridLocaliser(Checkpointed, Map):
         self._judge(share, odds, bool(evidence.failed))
         now = self.localisation()
         self._course.append(now)
-        dtype = np.asarray(estimate.pose).dtype
-        return estimate._replace(
-            pose=now.pose.astype(dtype),
-            spread=np.sqrt(np.maximum(np.diag(now.covariance), 0.0)).astype(dtype),
-            lost=np.bool_(now.state != Localisation.FOUND),
-            action=np.int32(Action.NONE),
-            place=np.int32(-1),
-        )
+        return now.complete(estimate)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The whole state, with what tells the finished map from others."""

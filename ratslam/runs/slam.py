@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -28,8 +28,6 @@ from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, obse
 from tactile.frontend import TouchConfig
 from tactile.whisker_geometry import ur10_head
 from tactile.whisker_image import view_shape
-
-ODOMETRY = len(Odometry._fields)
 
 
 class Slam:
@@ -183,20 +181,18 @@ def _match_observation(given: Observation, like: Observation) -> Observation:
         InputError: an array has another shape, another kind of numbers, or numbers that are not finite.
     """
     names = (*(f"odometry.{name}" for name in Odometry._fields), *Observation._fields[1:])
-    pairs = zip((*given.odometry, *given[1:]), (*like.odometry, *like[1:]), strict=True)
-    matched = [_match_array(name, value, other) for name, (value, other) in zip(names, pairs, strict=True)]
-    return Observation(Odometry(*matched[:ODOMETRY]), *matched[ODOMETRY:])
-
-
-def _match_array(name: str, value: Any, like: np.ndarray) -> np.ndarray:
-    found = np.asarray(value)
-    if found.shape != like.shape:
-        raise InputError(name, f"shape {found.shape}", f"{like.shape}, as described")
-    if not np.can_cast(found.dtype, like.dtype, "same_kind"):
-        raise InputError(name, f"numbers of type {found.dtype}", str(like.dtype))
-    if found.dtype.kind == "f" and not np.isfinite(found).all():
-        raise InputError(name, "a number that is not finite", "finite numbers", "mask what is missing")
-    return found.astype(like.dtype)
+    values, others = (*given.odometry, *given[1:]), (*like.odometry, *like[1:])
+    matched = []
+    for name, found, other in zip(names, map(np.asarray, values), others, strict=True):
+        if found.shape != other.shape:
+            raise InputError(name, f"shape {found.shape}", f"{other.shape}, as described")
+        if not np.can_cast(found.dtype, other.dtype, "same_kind"):
+            raise InputError(name, f"numbers of type {found.dtype}", str(other.dtype))
+        if found.dtype.kind == "f" and not np.isfinite(found).all():
+            raise InputError(name, "a number that is not finite", "finite numbers", "mask what is missing")
+        matched.append(found.astype(other.dtype))
+    odometry = len(Odometry._fields)
+    return Observation(Odometry(*matched[:odometry]), *matched[odometry:])
 
 
 def _describe_whiskers(info: SourceInfo, touch: TouchConfig) -> SourceDescription:
