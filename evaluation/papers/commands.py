@@ -14,9 +14,7 @@ from ratslam.cli.common import (
     CommandParser,
     Commands,
     add_config,
-    add_count,
     add_set,
-    add_workers,
     own_folder,
     positive_integer,
     prepare_jax,
@@ -63,7 +61,7 @@ def add_commands(commands: Commands) -> None:
         "reproduce threshold whisker_maze -o runs/threshold",
     )  # fmt: skip
     add_config(threshold)
-    add_workers(threshold, 1)
+    _add_count(threshold, "--workers", 1, "processes")
     threshold.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="new folder for threshold.png and threshold.csv"
     )
@@ -116,13 +114,13 @@ def _add_rows(
         "--sessions", type=positive_integer, metavar="N",
         help="sessions or repeats per row (default: of the row)",
     )  # fmt: skip
-    add_count(parser, "--first", first, "seed of the first session; each has the next one")
+    _add_count(parser, "--first", first, "seed of the first session; each has the next one")
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / name, metavar="DIR",
         check=own_folder(f"{name}.md", name),
         help=f"folder for {name}.md, a picture per row, and what is used again (default runs/{name})",
     )  # fmt: skip
-    add_workers(parser, 1)
+    _add_count(parser, "--workers", 1, "processes")
     return parser
 
 
@@ -136,7 +134,7 @@ def _add_figure(names: Commands, name: str, title: str) -> None:
     """Registers a figure."""
     parser = names.add(name, _figure, title, f"reproduce {name} --sets 1")
     sets = SETS.get(name, USUAL_SETS)
-    add_count(parser, "--sets", sets, "mazes or trials per condition")
+    _add_count(parser, "--sets", sets, "mazes or trials per condition")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of all sets (default 0)")
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
@@ -144,7 +142,7 @@ def _add_figure(names: Commands, name: str, title: str) -> None:
         help=f"folder for {name}.csv and {name}.png (default runs/reproduce)",
     )  # fmt: skip
     add_set(parser)
-    add_workers(parser)
+    _add_count(parser, "--workers", 0, "processes")
     parser.set_defaults(name=name)
 
 
@@ -255,6 +253,12 @@ TIMED = ("speed", "cycles", "batches")
 """Tables of times."""
 
 
+def _add_count(parser: argparse.ArgumentParser, name: str, default: int, help: str) -> None:
+    """Adds an option for a positive integer; the default 0 stands for the number of cores."""
+    help = f"{help} (default {default or 'the number of cores'})"
+    parser.add_argument(name, type=positive_integer, default=default, metavar="N", help=help)
+
+
 def _add_tables(tables: Commands) -> None:
     """Registers the tables."""
 
@@ -264,7 +268,7 @@ def _add_tables(tables: Commands) -> None:
         return parser
 
     touch = add("touch", "whisker sessions under many conditions", "--rows main --sessions 1")
-    add_count(touch, "--first", 31100, "number of the first maze; each session has the next one")
+    _add_count(touch, "--first", 31100, "number of the first maze; each session has the next one")
     touch.add_argument(
         "--sessions",
         type=positive_integer,
@@ -274,41 +278,41 @@ def _add_tables(tables: Commands) -> None:
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
     _add_session_file(touch, "touch.csv")
     grid = add("grid", "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
-    add_count(grid, "--arenas", 10, "arenas per row")
-    add_count(grid, "--first", 9000, "seed of the first arena")
+    _add_count(grid, "--arenas", 10, "arenas per row")
+    _add_count(grid, "--first", 9000, "seed of the first arena")
     grid.add_argument("--worlds", nargs="+", choices=("A", "B", "rotated"), help="only these kinds of arena")
     laser = add("laser", "recordings with laser views or given places", "--rows square")
-    add_count(laser, "--copies", 10, "perturbed copies per recording")
+    _add_count(laser, "--copies", 10, "perturbed copies per recording")
     buildings = add("buildings", "real buildings: map against odometry", "--copies 2")
-    add_count(buildings, "--copies", 10, "perturbed copies per recording")
+    _add_count(buildings, "--copies", 10, "perturbed copies per recording")
     _add_session_file(buildings, "buildings.csv")
     health = add("health", "how well the health estimate detects bad maps", "--sessions 1")
-    add_count(health, "--sessions", 2, "sessions per row")
-    add_workers(health)
+    _add_count(health, "--sessions", 2, "sessions per row")
+    _add_count(health, "--workers", 0, "processes")
     closures = add("closures", "fits and tests the log-odds of closure sequences", "--sessions 2")
-    add_count(closures, "--sessions", 6, "sessions per row")
-    add_workers(closures)
+    _add_count(closures, "--sessions", 6, "sessions per row")
+    _add_count(closures, "--workers", 0, "processes")
     closures.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="folder for closure_judge.json, the weights"
     )
     closures.set_defaults(file="closure_judge.json")
     for parser in (touch, grid, laser, buildings):
         parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
-        add_workers(parser)
+        _add_count(parser, "--workers", 0, "processes")
     speed = add("speed", "microseconds per pose-cell step by network size", "--rows 21 41")
     speed.add_argument(
         "--rows", nargs="+", type=positive_integer, metavar="N", help="only these numbers of cells a side"
     )
-    add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
+    _add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
     cycles = add("cycles", "microseconds per whole cycle, map included", "--rows square")
     cycles.add_argument("--rows", nargs="+", metavar="ROW", help="only these sessions")
-    add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
+    _add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
     cycles.add_argument("--profile", action="store_true", help="where the time goes instead")
     batches = add("batches", "many sets or sessions in one call, on a GPU too", "--steps 160")
-    add_count(batches, "--sets", 1000, "parameter sets in one call")
-    add_count(batches, "--sessions", 256, "sessions in one call")
-    add_count(batches, "--steps", 1600, "steps of a session")
-    add_count(batches, "--rounds", 3, "repeats, of which the median is taken")
+    _add_count(batches, "--sets", 1000, "parameter sets in one call")
+    _add_count(batches, "--sessions", 256, "sessions in one call")
+    _add_count(batches, "--steps", 1600, "steps of a session")
+    _add_count(batches, "--rounds", 3, "repeats, of which the median is taken")
 
 
 def _add_session_file(parser: argparse.ArgumentParser, file: str) -> None:

@@ -19,12 +19,36 @@ from jax import lax
 from ratslam.classic import pose_cells
 from ratslam.classic.cell_probe import activity_of
 from ratslam.classic.config import NetworkConfig, rings
-from ratslam.classic.levels import window_levels
+from ratslam.classic.excitation_inhibition import Window
+from ratslam.classic.levels import Level, window_levels
 from ratslam.classic.pose_cells import PoseCells
 from tactile.base.types import Array, Odometry
 
 BLOCK = 8
 """Networks computed at a time; they fit into a processor's cache."""
+
+
+def tuned_levels(
+    levels: tuple[Level, ...], excite: Array, inhibit: Array, threshold: Array
+) -> tuple[Level, ...]:
+    """The levels with kernels of the same widths but other standard deviations, which may be traced.
+
+    Args:
+        excite, inhibit: standard deviations, cells. threshold: global inhibition.
+    """
+
+    def kernel(like: Array, sigma: Array) -> Array:
+        offset = (np.arange(len(like)) - len(like) // 2).astype(sigma.dtype)
+        weight = jnp.exp(offset**2 / (-2 * sigma**2))
+        return weight / weight.sum()
+
+    def tuned(window: Window) -> Window:
+        kernels = kernel(window.excite, excite), kernel(window.inhibit, inhibit)
+        return window._replace(excite=kernels[0], inhibit=kernels[1], sigma=excite, threshold=threshold)
+
+    return tuple(level._replace(window=tuned(level.window)) for level in levels)
+
+
 SEGMENT = 128
 """Steps of a segment: long enough that calls cost nothing, short enough that little is computed again."""
 LONGEST_WAIT = 64
@@ -183,8 +207,7 @@ def _walk(
     ring = rings(config, dtype)
 
     def simulate(own: CellSets, walker: Walker) -> tuple[Walker, CellTrack]:
-        kernels = own.excite_sigma, own.inhibit_sigma, own.global_inhibition
-        tuned = tuple(level._replace(window=level.window.with_kernels(*kernels)) for level in levels)
+        tuned = tuned_levels(levels, own.excite_sigma, own.inhibit_sigma, own.global_inhibition)
 
         def step(walker: Walker, row: CellCourse) -> tuple[Walker, CellTrack]:
             cells, packet = walker

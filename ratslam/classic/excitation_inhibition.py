@@ -14,7 +14,6 @@ from collections.abc import Callable
 from functools import reduce
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -66,19 +65,6 @@ class Window(NamedTuple):
     def uses_matrices(self, k: int) -> bool:
         """Whether activity moves along axis k by products with matrices."""
         return self.wraps(k) and self.shape[k] < MATRIX_BELOW
-
-    def with_kernels(self, excite: Array, inhibit: Array, threshold: Array) -> Window:
-        """The window with kernels of the same widths but other standard deviations, which may be traced.
-
-        Args:
-            excite, inhibit: standard deviations, cells. threshold: global inhibition.
-        """
-        return self._replace(
-            excite=_gaussian(len(self.excite), excite),
-            inhibit=_gaussian(len(self.inhibit), inhibit),
-            sigma=excite,
-            threshold=threshold,
-        )
 
     def ring_sizes(self) -> np.ndarray:
         """[3] int32 cells of the torus along x, y and heading."""
@@ -207,8 +193,8 @@ def make_window(config: NetworkConfig, inner: int | None, dtype: np.dtype) -> Wi
         at = np.arange(size)
         outer = np.zeros(size, bool) if whole else (at < margin) | (at >= size - margin)
         margin_mask = margin_mask | outer.reshape([-1 if axis == k else 1 for axis in range(3)])
-    excite = _gaussian(config.excite_width, np.float64(config.excite_sigma)).astype(dtype)
-    inhibit = _gaussian(config.inhibit_width, np.float64(config.inhibit_sigma)).astype(dtype)
+    excite = _gaussian(config.excite_width, config.excite_sigma, dtype)
+    inhibit = _gaussian(config.inhibit_width, config.inhibit_sigma, dtype)
     unit, (heading, y, x) = 2 * np.pi / config.cells_heading, sizes
     sigma, threshold = config.excite_sigma, config.global_inhibition
     return Window((heading, y, x), rings, excite, inhibit, sigma, threshold, unit, margin, margin_mask, gap)
@@ -306,9 +292,6 @@ def _first_peak(ring: int, marginal: Array, first: Array) -> Array:
     return jnp.argmin(jnp.where(tied, at, ring)).astype(jnp.int32)
 
 
-def _gaussian(width: int, sigma: Any) -> Any:
-    offset = np.arange(width) - width // 2
-    weight = (jnp if isinstance(sigma, jax.Array) else np).exp(
-        offset.astype(sigma.dtype) ** 2 / (-2 * sigma**2)
-    )
-    return weight / weight.sum()
+def _gaussian(width: int, sigma: float, dtype: np.dtype) -> np.ndarray:
+    weight = np.exp((np.arange(width) - width // 2).astype(float) ** 2 / (-2 * np.float64(sigma) ** 2))
+    return (weight / weight.sum()).astype(dtype)

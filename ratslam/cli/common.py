@@ -125,17 +125,6 @@ def add_set(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_workers(parser: argparse.ArgumentParser, processes: int = 0) -> None:
-    """Adds `--workers`; 0 processes mean one a core."""
-    add_count(parser, "--workers", processes, "processes")
-
-
-def add_count(parser: argparse.ArgumentParser, name: str, default: int, help: str) -> None:
-    """Adds an option for a positive integer; the default 0 stands for the number of cores."""
-    help = f"{help} (default {default or 'the number of cores'})"
-    parser.add_argument(name, type=positive_integer, default=default, metavar="N", help=help)
-
-
 def positive_integer(text: str) -> int:
     """Argument type of an integer from 1 on."""
     if not text.isdecimal() or int(text) < 1:

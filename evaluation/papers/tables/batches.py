@@ -22,7 +22,7 @@ from jax import lax
 from evaluation.papers.tables.cycles import SESSIONS
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.speed import MOTION, interleaved_medians, replay_network
-from evaluation.studies.network_batch import BLOCK
+from evaluation.studies.network_batch import BLOCK, tuned_levels
 from ratslam.classic import pose_cells
 from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.levels import window_levels
@@ -173,7 +173,7 @@ def _networks(config: NetworkConfig, levels: int | None, sets: Sets, course: Cou
 
     def simulate(network: Sets) -> Track:
         *kernels, factor = network
-        tuned = tuple(level._replace(window=level.window.with_kernels(*kernels)) for level in used)
+        tuned = tuned_levels(used, *kernels)
 
         def step(cells: Any, row: Course) -> Any:
             motion, recall, energy = row
