@@ -15,14 +15,13 @@ from ratslam.cli.common import (
     Commands,
     add_config,
     add_set,
-    own_folder,
     positive_integer,
     prepare_jax,
     read_config,
 )
 from ratslam.runs.settings.packaged import find_config
 from tactile.base.errors import InputError
-from tactile.base.files import require_new_file
+from tactile.base.files import require_new_file, require_own_folder
 
 SALMAN2016 = {
     "fig2": "odometry drift over three clockwise laps",
@@ -77,7 +76,7 @@ def add_commands(commands: Commands) -> None:
     real.set_defaults(page="real")
     real.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
-        check=own_folder("real.md"),
+        check=partial(require_own_folder, marks=["real.md"]),
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
     title = "maps found again, continued, merged and changed"
@@ -117,7 +116,7 @@ def _add_rows(
     _add_count(parser, "--first", first, "seed of the first session; each has the next one")
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / name, metavar="DIR",
-        check=own_folder(f"{name}.md", name),
+        check=partial(require_own_folder, marks=[f"{name}.md", name]),
         help=f"folder for {name}.md, a picture per row, and what is used again (default runs/{name})",
     )  # fmt: skip
     _add_count(parser, "--workers", 1, "processes")
@@ -138,7 +137,7 @@ def _add_figure(names: Commands, name: str, title: str) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of all sets (default 0)")
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
-        check=own_folder(*(f"{figure}.csv" for figure in SALMAN2016 | FOX2012)),
+        check=partial(require_own_folder, marks=[f"{figure}.csv" for figure in SALMAN2016 | FOX2012]),
         help=f"folder for {name}.csv and {name}.png (default runs/reproduce)",
     )  # fmt: skip
     add_set(parser)
@@ -318,7 +317,8 @@ def _add_tables(tables: Commands) -> None:
 def _add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
     """Registers `-o` and `--against` of a table whose sessions are written to a file."""
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", check=own_folder(*SESSION_FILES),
+        "-o", "--output", type=Path, metavar="DIR",
+        check=partial(require_own_folder, marks=SESSION_FILES),
         help=f"folder for {file}, the figures of each session as soon as it is done",
     )  # fmt: skip
     _add_against(parser, file)

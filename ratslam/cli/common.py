@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import shtab
 
 from ratslam.runs.settings.packaged import packaged_configs
-from tactile.base.files import require_new_file, require_own_folder
+from tactile.base.files import require_new_file
 
 if TYPE_CHECKING:
     from ratslam.runs.settings.run_config import RunConfig
@@ -59,11 +59,6 @@ class CommandParser(argparse.ArgumentParser):
         if options.get("type") is Path:
             action.complete = shtab.FILE  # type: ignore[attr-defined]
         return action
-
-
-def own_folder(*marks: str) -> Callable[[Path], None]:
-    """The check of a folder that a command makes, or goes on with if one of the marks is in it."""
-    return lambda path: require_own_folder(path, marks)
 
 
 class Commands:
