@@ -60,6 +60,11 @@ class CommandParser(argparse.ArgumentParser):
             action.complete = shtab.FILE  # type: ignore[attr-defined]
         return action
 
+    def add_path(self, name: str, metavar: str, help: str, **options: Any) -> None:
+        """Adds an argument or an option for a file or folder; the name `-o` stands for `--output` too."""
+        names = ("-o", "--output") if name == "-o" else (name,)
+        self.add_argument(*names, type=Path, metavar=metavar, help=help, **options)
+
 
 class Commands:
     """The commands of a parser: of the program, or of a command that has commands of its own.
@@ -104,11 +109,9 @@ class Commands:
         return parser
 
 
-def add_config(parser: argparse.ArgumentParser, what: str = "configuration file (YAML)") -> None:
+def add_config(parser: CommandParser, what: str = "configuration file (YAML)") -> None:
     """Adds the configuration, `--list` for those that come with the program, and `--set`."""
-    parser.add_argument(
-        "config", type=Path, metavar="CONFIG", help=f"{what}, or the name of a packaged one (--list)"
-    )
+    parser.add_path("config", "CONFIG", f"{what}, or the name of a packaged one (--list)")
     parser.add_argument("--list", action=_ListConfigs, help="list the packaged configurations and exit")
     add_set(parser)
 

@@ -11,7 +11,7 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import INTERRUPTED, Commands, add_set, prepare_jax
+from ratslam.cli.common import INTERRUPTED, CommandParser, Commands, add_set, prepare_jax
 from ratslam.cli.run import add_rerun, open_target
 from tactile.base.errors import InputError, tell
 from tactile.base.files import require_new_file
@@ -29,7 +29,7 @@ def add_map(commands: Commands) -> None:
     _add_json(info)
     diff = kinds.add("diff", _diff, "say what differs between two maps", "map diff runs/square runs/again")
     _add_map(diff)
-    diff.add_argument("other", type=Path, metavar="MAP", help="the map to compare with it")
+    diff.add_path("other", "MAP", "the map to compare with it")
     _add_json(diff)
     undo = kinds.add(
         "undo", _undo, "remove a closure sequence from a map", "map undo runs/square 0 -o runs/undone.npz"
@@ -38,9 +38,7 @@ def add_map(commands: Commands) -> None:
     undo.add_argument(
         "sequence", type=int, metavar="SEQUENCE", help="its number, as `map info --json` and closures.csv say"
     )
-    undo.add_argument(
-        "-o", "--output", type=Path, metavar="MAP", help="the new map file (default: replaces the map file)"
-    )
+    undo.add_path("-o", "MAP", "the new map file (default: replaces the map file)")
     crop = kinds.add(
         "crop", _crop, "cut out a part of a map", "map crop runs/square --box 0,0,2,1 -o runs/part.npz"
     )
@@ -53,11 +51,11 @@ def add_map(commands: Commands) -> None:
     part.add_argument(
         "--piece", type=int, metavar="K", help="a piece, which nothing joins to the others, from 0"
     )
-    crop.add_argument("-o", "--output", type=Path, required=True, metavar="MAP", help="the new map file")
+    crop.add_path("-o", "MAP", "the new map file", required=True)
 
 
-def _add_map(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("map", type=Path, metavar="MAP", help="a run directory or a map file")
+def _add_map(parser: CommandParser) -> None:
+    parser.add_path("map", "MAP", "a run directory or a map file")
 
 
 def _add_json(parser: argparse.ArgumentParser) -> None:
@@ -198,16 +196,14 @@ def add_localise(commands: Commands) -> None:
         "localise", _localise, "find a recording's poses in a saved map",
         "localise runs/whisker_maze another_day.yaml -o runs/found", "maps",
     )  # fmt: skip
-    localise.add_argument("map", type=Path, metavar="MAP", help="a run directory or its map.npz")
-    localise.add_argument(
-        "recording", type=Path, metavar="RECORDING",
-        help="configuration with the recording or simulation to localise, or a recording of the map's sensor "
+    localise.add_path("map", "MAP", "a run directory or its map.npz")
+    localise.add_path(
+        "recording", "RECORDING",
+        "configuration with the recording or simulation to localise, or a recording of the map's sensor "
         "(the method and its settings are those of the map)",
     )  # fmt: skip
     add_set(localise)
-    localise.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/RECORDING_in_MAP)"
-    )
+    localise.add_path("-o", "DIR", "new run directory (default runs/RECORDING_in_MAP)")
     add_rerun(localise)
 
 
@@ -243,11 +239,9 @@ def add_merge(commands: Commands) -> None:
         "merge", _merge, "make one map of the sessions in several",
         "merge runs/monday runs/tuesday -o runs/both", "maps",
     )  # fmt: skip
-    merge.add_argument("maps", type=Path, nargs="+", metavar="MAP", help="run directories or map files")
-    merge.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="MAP",
-        help="the new map: a file that ends in .npz, or a folder for it with its trajectory and graph",
-    )  # fmt: skip
+    merge.add_path("maps", "MAP", "run directories or map files", nargs="+")
+    help = "the new map: a file that ends in .npz, or a folder for it with its trajectory and graph"
+    merge.add_path("-o", "MAP", help, required=True)
     merge.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -271,7 +265,7 @@ def add_path(commands: Commands) -> None:
     path = commands.add(
         "path", _path, "find the way on a saved map", "path runs/square --from here --to -0.1,0.8", "maps"
     )
-    path.add_argument("map", type=Path, metavar="MAP", help="run directory, or its map.npz")
+    path.add_path("map", "MAP", "run directory, or its map.npz")
     path.add_argument(
         "--from", dest="start", default="here", metavar="X,Y|EXPERIENCE|here",
         help="start: a point, m, such as -0.1,0.2, an experience, or the map's last pose (default)",
@@ -285,10 +279,7 @@ def add_path(commands: Commands) -> None:
         "--mode", choices=("time", "temporal"), default="time",
         help="least expected time (default), or RatSLAM's goal temporal map",
     )  # fmt: skip
-    path.add_argument(
-        "-o", "--output", type=Path, metavar="PNG", check=_require_new_picture,
-        help="draw the way to a new file",
-    )  # fmt: skip
+    path.add_path("-o", "PNG", "draw the way to a new file", check=_require_new_picture)
     path.add_argument("--json", action="store_true", help="print JSON")
 
 

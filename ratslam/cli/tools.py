@@ -29,29 +29,26 @@ def add_tools(commands: Commands) -> None:
         "recover", _recover, "repair a recording that was cut off",
         "tools recover runs/maze/session.mcap -o runs/whole.mcap",
     )  # fmt: skip
-    recover.add_argument("recording", type=Path, metavar="MCAP", help="the damaged recording")
-    recover.add_argument("-o", "--output", type=Path, required=True, metavar="MCAP", help="the new file")
+    recover.add_path("recording", "MCAP", "the damaged recording")
+    recover.add_path("-o", "MCAP", "the new file", required=True)
 
     convert = tools.add(
         "convert", _convert, "turn an OpenRatSLAM parameter file into a configuration",
         "tools convert config_irat.txt --recording irat_red.bag -o irat.yaml",
     )  # fmt: skip
-    convert.add_argument("parameters", type=Path, metavar="INI", help="the parameter file")
-    convert.add_argument(
-        "--recording", type=Path, metavar="FILE",
-        help="the bag or video to map (default ROOT.bag, where ROOT is `topic_root` of the parameter file)",
+    convert.add_path("parameters", "INI", "the parameter file")
+    convert.add_path(
+        "--recording", "FILE",
+        "the bag or video to map (default ROOT.bag, where ROOT is `topic_root` of the parameter file)",
     )  # fmt: skip
     to_file = "write to this file instead of standard output"
-    convert.add_argument("-o", "--output", type=Path, metavar="YAML", help=to_file)
+    convert.add_path("-o", "YAML", to_file)
 
     schema = tools.add(
         "schema", _schema, "print the JSON schema of configurations, for editors",
         "tools schema -o runs/schema.json",
     )  # fmt: skip
-    schema.add_argument(
-        "-o", "--output", type=Path, metavar="FILE",
-        check=partial(require_new_file, replaces=SCHEMA_START), help=to_file,
-    )  # fmt: skip
+    schema.add_path("-o", "FILE", to_file, check=partial(require_new_file, replaces=SCHEMA_START))
 
     tools.add("version", _version, "print the versions of ratslam, Python and JAX", "tools version")
 
@@ -196,12 +193,12 @@ def add_export(commands: Commands) -> None:
         "export", _export, "write a run as a standard file",
         "export runs/square -o runs/square.mcap", "files",
     )  # fmt: skip
-    export.add_argument("run", type=Path, metavar="RUN", help="the run directory")
-    export.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="FILE",
-        help="the new file: .mcap for ROS 2 tools, .tum trajectory, .g2o pose graph, .json or .graphml "
+    export.add_path("run", "RUN", "the run directory")
+    export.add_path(
+        "-o", "FILE",
+        "the new file: .mcap for ROS 2 tools, .tum trajectory, .g2o pose graph, .json or .graphml "
         "experiences, .yaml nav2 map, .nwb or .npz spikes of recorded pose cells, .csv their scores; a name "
-        "without a suffix becomes a ROS 2 bag folder",
+        "without a suffix becomes a ROS 2 bag folder", required=True,
     )  # fmt: skip
     export.add_argument(
         "--peak-rate", type=_rate, default=20.0, metavar="HZ",
