@@ -277,19 +277,16 @@ def _shifter(window: Window, activity: Array, k: int, reach: int) -> Callable[[i
 
 
 def _peak(window: Window, activity: Array, first: Array) -> tuple[Array, Array, Array]:
-    """Indices of the largest activity: heading, y, x."""
-    heading = _first_peak(window.rings[0], jnp.max(activity, axis=(1, 2)), first[0])
-    layer = lax.dynamic_index_in_dim(activity, heading, 0, keepdims=False)
-    y = _first_peak(window.rings[1], jnp.max(layer, axis=1), first[1])
-    row = lax.dynamic_index_in_dim(layer, y, 0, keepdims=False)
-    return heading, y, _first_peak(window.rings[2], row, first[2])
-
-
-def _first_peak(ring: int, marginal: Array, first: Array) -> Array:
-    """Index of the largest value of a marginal [size]; among ties, the first cell of the torus."""
-    at = (first + np.arange(len(marginal), dtype=np.int32)) % ring
-    tied = marginal >= jnp.max(marginal) * (1 - TIE)
-    return jnp.argmin(jnp.where(tied, at, ring)).astype(jnp.int32)
+    """Indices of the largest activity: heading, y, x; among ties along an axis, the torus's first cell."""
+    found = []
+    for k, ring in enumerate(window.rings):
+        marginal = jnp.max(activity, axis=(1, 2)[: 2 - k])
+        at = (first[k] + np.arange(len(marginal), dtype=np.int32)) % ring
+        tied = marginal >= jnp.max(marginal) * (1 - TIE)
+        found.append(jnp.argmin(jnp.where(tied, at, ring)).astype(jnp.int32))
+        activity = lax.dynamic_index_in_dim(activity, found[k], 0, keepdims=False)
+    heading, y, x = found
+    return heading, y, x
 
 
 def _gaussian(width: int, sigma: float, dtype: np.dtype) -> np.ndarray:
