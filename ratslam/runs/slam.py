@@ -44,6 +44,8 @@ class Slam:
     Attributes:
         config: completed for the source. source: description of the readings. session: the backend's session.
         estimate: of the last step. warnings: about the source of the configuration, a sentence each.
+        cells: [C] float32 activity of the chosen pose cells (`cells.chosen`) after the last step; None before
+            the first, without `cells` in the configuration, and of a loaded map. A loop makes no sums.
 
     Raises:
         InputErrors: the configuration has errors.
@@ -70,7 +72,7 @@ class Slam:
         cells = config.cells and config.cells.model_copy(update={"sums": None})
         self.session = build_session(config.model_copy(update={"cells": cells}), observed)
         self.estimate = START
-        self._cells: np.ndarray | None = None
+        self.cells: np.ndarray | None = None
         self._frontend = observed.start() if isinstance(observed, TouchSource) else None
         self._blank = observation(
             Odometry(0.0, 0.0, 0.0, 0.0), view_shape=observed.view_shape, whiskers=observed.whiskers
@@ -85,12 +87,6 @@ class Slam:
     def steps(self) -> int:
         """Number of observations so far."""
         return self.session.steps
-
-    @property
-    def cells(self) -> np.ndarray | None:
-        """[C] float32 activity of the chosen pose cells (`cells.chosen`) after the last step; None before the
-        first, without `cells` in the configuration, and of a loaded map. A loop makes no sums."""
-        return self._cells
 
     def step(self, reading: Sample | Observation | Cycle | Whisk | Report) -> PoseEstimate:
         """Folds the next reading into the map; whisker readings go through the touch front end.
@@ -119,7 +115,7 @@ class Slam:
             step = self.session.step(_match_observation(observed, self._blank))
             entry = BACKENDS.get(self.config.backend, "backend")
             self.estimate = PoseEstimate.of_step(step, entry.outcome(step.evidence), self.warnings)
-            self._cells = step.probed
+            self.cells = step.probed
         return self.estimate
 
     def trajectory(self) -> np.ndarray:
