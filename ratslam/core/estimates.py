@@ -120,27 +120,19 @@ class LocalisedPose(NamedTuple):
 
 
 class LocalisedCourse(Checkpointed):
-    """The states and poses of all steps of a session."""
+    """The poses and states of all steps of a session, and what `write_course` writes of them."""
 
     def __init__(self) -> None:
         self.pose = GrowableArray((3,), np.float64)
-        self._states = GrowableArray((), np.int64)
-        self._record = GrowableArray((3,), np.float64)
+        self.states = GrowableArray((), np.int64)
+        self.record = GrowableArray((3,), np.float64)
 
     def append(self, now: LocalisedPose) -> None:
         """Adds a step."""
         deviation = float(np.sqrt(max(np.linalg.eigvalsh(now.covariance[:2, :2])[1], 0.0)))
         self.pose.append(now.pose)
-        self._states.append(int(now.state))
-        self._record.append((now.mass, now.log_odds, deviation))
-
-    def states(self) -> np.ndarray:
-        """[T] the `Localisation` at each step."""
-        return self._states.rows.copy()
-
-    def write(self, path: Path) -> None:
-        """Writes the course as CSV."""
-        write_course(path, self._states.rows, self._record.rows)
+        self.states.append(int(now.state))
+        self.record.append((now.mass, now.log_odds, deviation))
 
 
 def pieces_of(states: np.ndarray) -> np.ndarray:

@@ -29,6 +29,7 @@ from ratslam.core.estimates import (
     LocalisedCourse,
     LocalisedPose,
     pieces_of,
+    write_course,
 )
 from ratslam.grid import particles
 from ratslam.grid.config import GridConfig
@@ -81,10 +82,10 @@ class GridLocaliser(Checkpointed, Map):
 
     def states(self) -> np.ndarray:
         """[T] the `Localisation` at each step."""
-        return self._course.states()
+        return self._course.states.rows.copy()
 
     def pieces(self) -> np.ndarray:
-        return pieces_of(self._course.states())
+        return pieces_of(self._course.states.rows)
 
     def grid(self) -> GridDrawing:
         """The finished map."""
@@ -92,8 +93,9 @@ class GridLocaliser(Checkpointed, Map):
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """State, mass and log-odds of every step as CSV, and the finished map."""
+        course = self._course
         return {
-            "localisation.csv": self._course.write,
+            "localisation.csv": lambda path: write_course(path, course.states.rows, course.record.rows),
             "grid.npz": lambda path: np.savez_compressed(path, **self._drawn._asdict()),
         }
 
