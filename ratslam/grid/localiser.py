@@ -187,12 +187,7 @@ class Search:
     """
 
     def __init__(
-        self,
-        config: GridConfig,
-        expected: Expectation,
-        free: np.ndarray,
-        count: int,
-        dtype: np.dtype,
+        self, config: GridConfig, expected: Expectation, free: np.ndarray, count: int, dtype: np.dtype
     ) -> None:
         self.config, self.expected, self.count, self.dtype = config, expected, count, dtype
         self.agreement = {name: values.astype(dtype) for name, values in counted_agreement().items()}

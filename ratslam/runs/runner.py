@@ -34,11 +34,7 @@ from ratslam.runs.continuation import checkpoint_of, resume_session
 from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.map_results import score_and_plot, write_map_results
 from ratslam.runs.map_settings import Sensor
-from ratslam.runs.run_directory import (
-    OnlineErrorLog,
-    RunDirectory,
-    WhiskerView,
-)
+from ratslam.runs.run_directory import OnlineErrorLog, RunDirectory, WhiskerView
 from ratslam.runs.saved_map import NAME, describe_readings, map_file, read_map, write_map
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import dump
