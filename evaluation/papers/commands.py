@@ -14,17 +14,14 @@ from ratslam.cli.common import (
     CommandParser,
     Commands,
     add_config,
-    add_count,
     add_set,
-    add_workers,
-    own_folder,
     positive_integer,
     prepare_jax,
     read_config,
 )
 from ratslam.runs.settings.packaged import find_config
 from tactile.base.errors import InputError
-from tactile.base.files import require_new_file
+from tactile.base.files import require_new_file, require_own_folder
 
 SALMAN2016 = {
     "fig2": "odometry drift over three clockwise laps",
@@ -58,24 +55,24 @@ def add_commands(commands: Commands) -> None:
     for paper, figures in (("Salman & Pearson", SALMAN2016), ("Fox et al.", FOX2012)):
         for name, title in figures.items():
             parser = names.add(name, _figure, f"{paper}: {title}", f"reproduce {name} --sets 1")
-            add_count(parser, "--sets", SETS.get(name, USUAL_SETS), "mazes or trials per condition")
+            _add_count(parser, "--sets", SETS.get(name, USUAL_SETS), "mazes or trials per condition")
             parser.add_argument(
                 "--seed", type=int, default=0, metavar="S", help="seed of all sets (default 0)"
             )
             parser.add_argument(
                 "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
-                check=own_folder(*(f"{figure}.csv" for figure in SALMAN2016 | FOX2012)),
+                check=partial(require_own_folder, marks=[f"{figure}.csv" for figure in SALMAN2016 | FOX2012]),
                 help=f"folder for {name}.csv and {name}.png (default runs/reproduce)",
             )  # fmt: skip
             add_set(parser)
-            add_workers(parser)
+            _add_count(parser, "--workers", 0, "processes")
             parser.set_defaults(name=name)
     threshold = names.add(
         "threshold", _threshold, "Salman & Pearson: threshold tuning, classic method",
         "reproduce threshold whisker_maze -o runs/threshold",
     )  # fmt: skip
     add_config(threshold)
-    add_workers(threshold, 1)
+    _add_count(threshold, "--workers", 1, "processes")
     threshold.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="new folder for threshold.png and threshold.csv"
     )
@@ -91,7 +88,7 @@ def add_commands(commands: Commands) -> None:
     real.set_defaults(page="real")
     real.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
-        check=own_folder("real.md"),
+        check=partial(require_own_folder, marks=["real.md"]),
         help="folder for real.md and a picture per figure (default runs/real)",
     )  # fmt: skip
     title = "maps found again, continued, merged and changed"
@@ -128,13 +125,13 @@ def _add_rows(
         "--sessions", type=positive_integer, metavar="N",
         help="sessions or repeats per row (default: of the row)",
     )  # fmt: skip
-    add_count(parser, "--first", first, "seed of the first session; each has the next one")
+    _add_count(parser, "--first", first, "seed of the first session; each has the next one")
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("runs") / name, metavar="DIR",
-        check=own_folder(f"{name}.md", name),
+        check=partial(require_own_folder, marks=[f"{name}.md", name]),
         help=f"folder for {name}.md, a picture per row, and what is used again (default runs/{name})",
     )  # fmt: skip
-    add_workers(parser, 1)
+    _add_count(parser, "--workers", 1, "processes")
     return parser
 
 
@@ -237,6 +234,12 @@ TIMED = ("speed", "cycles", "batches")
 """Tables of times."""
 
 
+def _add_count(parser: argparse.ArgumentParser, name: str, default: int, help: str) -> None:
+    """Adds an option for a positive integer; the default 0 stands for the number of cores."""
+    help = f"{help} (default {default or 'the number of cores'})"
+    parser.add_argument(name, type=positive_integer, default=default, metavar="N", help=help)
+
+
 def _add_tables(tables: Commands) -> None:
     """Registers the tables."""
 
@@ -246,7 +249,7 @@ def _add_tables(tables: Commands) -> None:
         return parser
 
     touch = add("touch", "whisker sessions under many conditions", "--rows main --sessions 1")
-    add_count(touch, "--first", 31100, "number of the first maze; each session has the next one")
+    _add_count(touch, "--first", 31100, "number of the first maze; each session has the next one")
     touch.add_argument(
         "--sessions",
         type=positive_integer,
@@ -256,47 +259,48 @@ def _add_tables(tables: Commands) -> None:
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
     _add_session_file(touch, "touch.csv")
     grid = add("grid", "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
-    add_count(grid, "--arenas", 10, "arenas per row")
-    add_count(grid, "--first", 9000, "seed of the first arena")
+    _add_count(grid, "--arenas", 10, "arenas per row")
+    _add_count(grid, "--first", 9000, "seed of the first arena")
     grid.add_argument("--worlds", nargs="+", choices=("A", "B", "rotated"), help="only these kinds of arena")
     laser = add("laser", "recordings with laser views or given places", "--rows square")
-    add_count(laser, "--copies", 10, "perturbed copies per recording")
+    _add_count(laser, "--copies", 10, "perturbed copies per recording")
     buildings = add("buildings", "real buildings: map against odometry", "--copies 2")
-    add_count(buildings, "--copies", 10, "perturbed copies per recording")
+    _add_count(buildings, "--copies", 10, "perturbed copies per recording")
     _add_session_file(buildings, "buildings.csv")
     health = add("health", "how well the health estimate detects bad maps", "--sessions 1")
-    add_count(health, "--sessions", 2, "sessions per row")
-    add_workers(health)
+    _add_count(health, "--sessions", 2, "sessions per row")
+    _add_count(health, "--workers", 0, "processes")
     closures = add("closures", "fits and tests the log-odds of closure sequences", "--sessions 2")
-    add_count(closures, "--sessions", 6, "sessions per row")
-    add_workers(closures)
+    _add_count(closures, "--sessions", 6, "sessions per row")
+    _add_count(closures, "--workers", 0, "processes")
     closures.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="folder for closure_judge.json, the weights"
     )
     closures.set_defaults(file="closure_judge.json")
     for parser in (touch, grid, laser, buildings):
         parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
-        add_workers(parser)
+        _add_count(parser, "--workers", 0, "processes")
     speed = add("speed", "microseconds per pose-cell step by network size", "--rows 21 41")
     speed.add_argument(
         "--rows", nargs="+", type=positive_integer, metavar="N", help="only these numbers of cells a side"
     )
-    add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
+    _add_count(speed, "--rounds", 5, "repeats, of which the median is taken")
     cycles = add("cycles", "microseconds per whole cycle, map included", "--rows square")
     cycles.add_argument("--rows", nargs="+", metavar="ROW", help="only these sessions")
-    add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
+    _add_count(cycles, "--rounds", 5, "repeats, of which the median is taken")
     cycles.add_argument("--profile", action="store_true", help="where the time goes instead")
     batches = add("batches", "many sets or sessions in one call, on a GPU too", "--steps 160")
-    add_count(batches, "--sets", 1000, "parameter sets in one call")
-    add_count(batches, "--sessions", 256, "sessions in one call")
-    add_count(batches, "--steps", 1600, "steps of a session")
-    add_count(batches, "--rounds", 3, "repeats, of which the median is taken")
+    _add_count(batches, "--sets", 1000, "parameter sets in one call")
+    _add_count(batches, "--sessions", 256, "sessions in one call")
+    _add_count(batches, "--steps", 1600, "steps of a session")
+    _add_count(batches, "--rounds", 3, "repeats, of which the median is taken")
 
 
 def _add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
     """Registers `-o` and `--against` of a table whose sessions are written to a file."""
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", check=own_folder(*SESSION_FILES),
+        "-o", "--output", type=Path, metavar="DIR",
+        check=partial(require_own_folder, marks=SESSION_FILES),
         help=f"folder for {file}, the figures of each session as soon as it is done",
     )  # fmt: skip
     _add_against(parser, file)
@@ -363,8 +367,9 @@ def _timed_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
     from evaluation.studies.machine import one_core
 
     with one_core():
+        from evaluation.papers.tables.batches import batch_table
         from evaluation.papers.tables.cycles import cycle_table, profile_table
-        from evaluation.papers.tables.speed import SIZES, batch_table, speed_table
+        from evaluation.papers.tables.speed import SIZES, speed_table
 
         if name == "speed":
             yield from speed_table(arguments.rows or SIZES, arguments.rounds)

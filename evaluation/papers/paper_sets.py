@@ -26,7 +26,8 @@ from evaluation.studies.executor import run_tasks
 from ratslam.core.compilation import prepare_precision
 from ratslam.core.estimates import Estimate
 from ratslam.methods.classic import ClassicBackend, ClassicEvidence
-from ratslam.methods.config import ClassicBackendConfig, select_settings
+from ratslam.methods.config import ClassicBackendConfig
+from ratslam.methods.method_registry import backend_settings
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.in_memory import InMemorySource
 from robot.touch_source import observation_of
@@ -159,7 +160,8 @@ def sweep_thresholds(
     readings = [observation_of(sample) for sample in log]
     padding = readings[-1:] * (capacity_for(log.length) - len(readings))  # cut off below
     chunk = stack(readings + padding)
-    method = select_settings(config, ClassicBackendConfig)
+    method = backend_settings("classic", config)
+    assert isinstance(method, ClassicBackendConfig)
     found = _batch(method, log.view_shape, dtype.name, jnp.asarray(thresholds, dtype), chunk)
     return jax.tree.map(lambda column: np.asarray(column)[:, : log.length], found)
 

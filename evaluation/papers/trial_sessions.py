@@ -18,6 +18,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from evaluation.metrics.occupancy_grid import OccupancyGrid
@@ -28,7 +29,6 @@ from ratslam.core.backend import Backend
 from ratslam.core.compilation import Precision, prepare_precision
 from ratslam.core.session import Session, capacity_at
 from ratslam.grid.config import GridConfig
-from ratslam.grid.likelihoods import distinct_cells
 from ratslam.grid.map import ContactLog, contact_log, draw_occupancy
 from ratslam.methods.grid import GridBackend
 from ratslam.methods.method_registry import Sensors, backend_settings, build
@@ -46,7 +46,7 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, integrate, wrap
 from tactile.base.settings import Settings
-from tactile.base.types import Observation, stack
+from tactile.base.types import Array, Observation, stack
 from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFrontendConfig, WhiskerMount
 from tactile.whisker_geometry import PlanarWhiskers
 
@@ -341,8 +341,23 @@ def _compiled_filter(
     assert grid.side is not None
     feelers = ReportFrontendConfig(mounts=mounts, length=length).feelers
     prepare_precision(precision)
-    backend = GridBackend(grid, feelers, grid.side, precision, distinct_cells)
-    return Session(backend, precision=precision)
+    return Session(_DistinctCells(grid, feelers, grid.side, precision), precision=precision)
+
+
+class _DistinctCells(GridBackend):
+    def counted(self, cell: Array, contact: Array) -> Array:
+        return distinct_cells(cell, contact)
+
+
+def distinct_cells(cell: Array, contact: Array) -> Array:
+    """bool [N, W, G]: each cell along a whisker counts once in eq. 2, and not as free where its contact is.
+
+    Args: see `GridBackend.counted`.
+    """
+    same = jnp.all(cell[:, :, :, None] == cell[:, :, None], axis=-1)  # [N, W, G, G]
+    earlier = np.tri(cell.shape[2], k=-1, dtype=bool)
+    repeated = jnp.any(same & earlier[None, None], axis=-1)
+    return ~repeated & ~(same[..., -1] & contact[None, :, None])
 
 
 _trained_templates = lru_cache(maxsize=1)(train_strain_templates)

@@ -25,9 +25,9 @@ from evaluation.plots import style
 from evaluation.plots.cell_plot import draw_rate_map
 from evaluation.plots.style import BLUE, LABEL_GREY, WIDTH
 from evaluation.studies.executor import Executor
+from evaluation.studies.network_batch import SEGMENT, CellSets, CellTrack, walk
 from evaluation.studies.study_course import CELLS, StudyCourse, read_course
 from evaluation.studies.study_report import format_number, render_table
-from ratslam.classic.batch import SEGMENT, CellSets, CellTrack, Network, walk
 from ratslam.classic.config import rings, units
 from ratslam.classic.pose_cells import Outcome
 from ratslam.core.compilation import Precision, prepare_precision
@@ -292,9 +292,8 @@ def score_task(task: _Chunk) -> _SetScores:
     """The scores of a chunk; a part of one is filled up, so that its bits do not depend on the number."""
     prepare_precision(task.precision)
     rows = np.arange(task.size).clip(max=len(task.parameters) - 1)
-    columns = dict(zip(PARAMETERS, task.parameters[rows].T, strict=True))
-    noise = columns.pop("speed_noise"), columns.pop("heading_noise")
-    scores = score_sets(task.course, CellSets(Network(**columns), *noise), np.dtype(task.precision))
+    sets = CellSets(**dict(zip(PARAMETERS, task.parameters[rows].T, strict=True)))
+    scores = score_sets(task.course, sets, np.dtype(task.precision))
     return _SetScores(*(column[: len(task.parameters)] for column in scores))
 
 

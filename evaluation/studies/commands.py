@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -14,7 +15,6 @@ from ratslam.cli.common import (
     INPUT_ERROR,
     Commands,
     add_config,
-    own_folder,
     positive_integer,
     prepare_jax,
     read_config,
@@ -55,7 +55,8 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     study.add_argument("--scheduler", metavar="tcp://HOST:PORT", help="Dask scheduler to use instead")
     study.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", check=own_folder("runs.jsonl", "growth.jsonl", "sets"),
+        "-o", "--output", type=Path, metavar="DIR",
+        check=partial(require_own_folder, marks=["runs.jsonl", "growth.jsonl", "sets"]),
         help="folder of records and tables; recorded runs are not repeated (default runs/STUDY)",
     )  # fmt: skip
     error = "error on the Pareto front: em, ate, exm, map, ... or a scorecard quantity"

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.classic.batch import CellCourse
+from evaluation.studies.network_batch import CellCourse
 from ratslam.classic.config import NetworkConfig, network_of, rings, units
 from ratslam.network.config import PoseCellConfig
 from ratslam.runs.build_session import build_session, open_observations, read_observations

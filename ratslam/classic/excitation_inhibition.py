@@ -14,7 +14,6 @@ from collections.abc import Callable
 from functools import reduce
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -33,25 +32,18 @@ BOX = 3
 """The packet is decoded from the (2 BOX + 1)^3 cells around its peak."""
 
 
-class Axis(NamedTuple):
-    """One axis of a window: cells of the window and of the torus; wraps: the window is the full ring."""
-
-    size: int
-    ring: int
-    wraps: bool
-
-
 class Window(NamedTuple):
     """The shape of a window and the constants of the network.
 
     Attributes:
-        axes: heading, y, x. excite, inhibit: [w] kernels, the same along every axis. sigma: of excitation,
-            cells. threshold: global inhibition. unit: rad per heading cell. margin: cells along each face
-            that must stay empty. margin_mask: [H, Y, X] bool, these cells. gap: distance in cells beyond
-            which two packets do not interact.
+        shape: [H, Y, X] cells. rings: cells of the torus over heading, y, x. excite, inhibit: [w] kernels,
+            the same along every axis. sigma: of excitation, cells. threshold: global inhibition. unit: rad
+            per heading cell. margin: cells along each face that must stay empty. margin_mask: [H, Y, X] bool,
+            these cells. gap: distance in cells beyond which two packets do not interact.
     """
 
-    axes: tuple[Axis, Axis, Axis]
+    shape: tuple[int, int, int]
+    rings: tuple[int, int, int]
     excite: Array
     inhibit: Array
     sigma: Any
@@ -62,53 +54,40 @@ class Window(NamedTuple):
     gap: int
 
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """[H, Y, X]."""
-        heading, y, x = (axis.size for axis in self.axes)
-        return heading, y, x
-
-    @property
     def is_torus(self) -> bool:
         """Whether the window is the whole torus."""
-        return all(axis.wraps for axis in self.axes)
+        return self.shape == self.rings
 
-    def with_kernels(self, excite: Array, inhibit: Array, threshold: Array) -> Window:
-        """The window with kernels of the same widths but other standard deviations, which may be traced.
+    def wraps(self, k: int) -> bool:
+        """Whether the window is the full ring along axis k."""
+        return self.shape[k] == self.rings[k]
 
-        Args:
-            excite, inhibit: standard deviations, cells. threshold: global inhibition.
-        """
-        return self._replace(
-            excite=_gaussian(len(self.excite), excite),
-            inhibit=_gaussian(len(self.inhibit), inhibit),
-            sigma=excite,
-            threshold=threshold,
-        )
+    def uses_matrices(self, k: int) -> bool:
+        """Whether activity moves along axis k by products with matrices."""
+        return self.wraps(k) and self.shape[k] < MATRIX_BELOW
 
     def ring_sizes(self) -> np.ndarray:
         """[3] int32 cells of the torus along x, y and heading."""
-        return np.array([axis.ring for axis in self.axes[::-1]], np.int32)
+        return np.array(self.rings[::-1], np.int32)
 
     def origin_centred_on(self, pose: Array) -> Array:
         """[3] int32 first cell of a window centred on a pose; 0 along full rings."""
-        piece = np.array([not axis.wraps for axis in self.axes[::-1]])
-        return jnp.where(
-            piece, (jnp.floor(pose).astype(jnp.int32) - self.cells_before_centre()) % self.ring_sizes(), 0
-        )
+        first = (jnp.floor(pose).astype(jnp.int32) - self.cells_before_centre()) % self.ring_sizes()
+        return jnp.where(np.not_equal(self.shape, self.rings)[::-1], first, 0)
 
     def cells_before_centre(self) -> np.ndarray:
         """[3] int32 cells from the window's first cell to its centre, over x, y, heading."""
-        return np.array([axis.size // 2 - 1 for axis in self.axes[::-1]], np.int32)
+        return np.array(self.shape[::-1], np.int32) // 2 - 1
 
     def excite_and_inhibit(self, activity: Array) -> Array:
         """Activity after excitation, inhibition and threshold, not normalised. Both kernels are separable."""
-        window, before, inside = self, 0, activity.shape[2]
-        x, reach = window.axes[2], len(window.excite) // 2 + len(window.inhibit) // 2
-        if x.wraps and not _uses_matrices(x) and x.size + 2 * reach <= EVEN_ROW:
-            before, after = reach, EVEN_ROW - x.size - reach
+        window, before, inside = self, 0, self.shape[2]
+        reach = len(self.excite) // 2 + len(self.inhibit) // 2
+        if self.wraps(2) and not self.uses_matrices(2) and inside + 2 * reach <= EVEN_ROW:
+            before, after = reach, EVEN_ROW - inside - reach
             ends = activity[:, :, -before:], activity, activity[:, :, :after]
             activity = lax.optimization_barrier(jnp.concatenate(ends, axis=2))
-            window = window._replace(axes=(*window.axes[:2], Axis(EVEN_ROW, x.ring, False)))
+            window = self._replace(shape=(*self.shape[:2], EVEN_ROW))
         excited = _convolve(window, window.excite, activity)
         left = (excited - _convolve(window, window.inhibit, excited))[:, :, before : before + inside]
         return jnp.where(left >= window.threshold, left - window.threshold, 0.0)
@@ -122,8 +101,7 @@ class Window(NamedTuple):
                 Together less than a cell along each axis.
             shift: [3] int32, -1 to 1, motion of the window itself.
         """
-        heading = self.axes[0]
-        layer = (origin[2] + np.arange(heading.size, dtype=np.int32)) % heading.ring
+        layer = (origin[2] + np.arange(self.shape[0], dtype=np.int32)) % self.rings[0]
         along, across = rotate(motion[0], motion[1], layer.astype(motion.dtype) * self.unit)
         moved = shift.astype(motion.dtype)
         activity = _translate(self, activity, 1, (across + (lag[1] - moved[1]))[:, None, None])
@@ -144,10 +122,8 @@ class Window(NamedTuple):
     def holds_deposit(self, origin: Array, pose: Array) -> Array:
         """bool: a deposit at the pose would leave the margin of the window empty."""
         low = (jnp.floor(pose).astype(jnp.int32) - origin) % self.ring_sizes()
-        size = np.array([axis.size for axis in self.axes[::-1]], np.int32)
-        piece = np.array([not axis.wraps for axis in self.axes[::-1]])
-        fits = (low >= self.margin) & (low + 1 < size - self.margin)
-        return jnp.all(fits | ~piece)
+        fits = (low >= self.margin) & (low + 1 < np.array(self.shape[::-1], np.int32) - self.margin)
+        return jnp.all(fits | np.equal(self.shape, self.rings)[::-1])
 
     def deposit_gain(self, pose: Array) -> Array:
         """Factor on the energy of a deposit between cells that makes it excite as much as one on a cell.
@@ -181,12 +157,12 @@ class Window(NamedTuple):
         """
         first = origin[::-1]
         box, low = activity, []
-        for k, (axis, peak) in enumerate(zip(self.axes, _peak(self, activity, first), strict=True)):
-            if axis.wraps:
-                at = (peak + np.arange(-BOX, BOX + 1, dtype=np.int32)) % axis.size
+        for k, peak in enumerate(_peak(self, activity, first)):
+            if self.wraps(k):
+                at = (peak + np.arange(-BOX, BOX + 1, dtype=np.int32)) % self.shape[k]
                 box, begin = jnp.take(box, at, axis=k), peak - BOX
             else:
-                begin = jnp.clip(peak - BOX, 0, axis.size - 2 * BOX - 1)
+                begin = jnp.clip(peak - BOX, 0, self.shape[k] - 2 * BOX - 1)
                 box = lax.dynamic_slice_in_dim(box, begin, 2 * BOX + 1, k)
             low.append(begin)
         # Circular moments of the marginals [3, 2 BOX + 1] over heading, y, x, each on its ring.
@@ -207,20 +183,21 @@ def make_window(config: NetworkConfig, inner: int | None, dtype: np.dtype) -> Wi
     """A window that is exact for activity within `inner` cells along each axis; None: the whole torus."""
     margin = config.excite_width // 2
     gap = 2 * margin + config.inhibit_width // 2
-    axes, margin_mask = [], np.zeros((1, 1, 1), bool)
-    for k, ring in enumerate((config.cells_heading, config.cells_xy, config.cells_xy)):
+    sizes, margin_mask = [], np.zeros((1, 1, 1), bool)
+    rings = config.cells_heading, config.cells_xy, config.cells_xy
+    for k, ring in enumerate(rings):
         # A packet must not interact with itself around the ring.
         whole = inner is None or ring < inner + gap
         size = ring if whole or inner is None else inner + 2 * margin
-        axes.append(Axis(size, ring, whole))
+        sizes.append(size)
         at = np.arange(size)
         outer = np.zeros(size, bool) if whole else (at < margin) | (at >= size - margin)
         margin_mask = margin_mask | outer.reshape([-1 if axis == k else 1 for axis in range(3)])
-    excite = _gaussian(config.excite_width, np.float64(config.excite_sigma)).astype(dtype)
-    inhibit = _gaussian(config.inhibit_width, np.float64(config.inhibit_sigma)).astype(dtype)
-    unit, (heading, y, x) = 2 * np.pi / config.cells_heading, axes
+    excite = _gaussian(config.excite_width, config.excite_sigma, dtype)
+    inhibit = _gaussian(config.inhibit_width, config.inhibit_sigma, dtype)
+    unit, (heading, y, x) = 2 * np.pi / config.cells_heading, sizes
     sigma, threshold = config.excite_sigma, config.global_inhibition
-    return Window((heading, y, x), excite, inhibit, sigma, threshold, unit, margin, margin_mask, gap)
+    return Window((heading, y, x), rings, excite, inhibit, sigma, threshold, unit, margin, margin_mask, gap)
 
 
 def rotate(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
@@ -238,10 +215,9 @@ def _convolve(window: Window, kernel: Array, activity: Array) -> Array:
     """Activity convolved with an even kernel [w] along each axis."""
     half = len(kernel) // 2
     for k in (1, 0, 2):
-        if _uses_matrices(window.axes[k]):
-            activity = _multiply_along(
-                jnp.tensordot(kernel, _roll_matrices(window.axes[k], half, kernel.dtype), 1), activity, k
-            )
+        if window.uses_matrices(k):
+            matrix = jnp.tensordot(kernel, _roll_matrices(window.shape[k], half, kernel.dtype), 1)
+            activity = _multiply_along(matrix, activity, k)
             continue
         shape = activity.shape
         shifted = _shifter(window, activity, k, half)
@@ -254,26 +230,19 @@ def _convolve(window: Window, kernel: Array, activity: Array) -> Array:
 
 def _translate(window: Window, activity: Array, k: int, distance: Array) -> Array:
     """Activity moved along axis k by a distance [] or [H, 1, 1] in cells, with linear interpolation."""
-    reach = 1 if window.axes[k].wraps else 2
+    reach = 1 if window.wraps(k) else 2
     share = [jnp.maximum(0.0, 1 - jnp.abs(distance - t)) for t in range(-reach, reach + 1)]
-    if _uses_matrices(window.axes[k]):
-        return _multiply_along(
-            jnp.tensordot(jnp.stack(share, -1), _roll_matrices(window.axes[k], 1, activity.dtype), 1),
-            activity,
-            k,
-        )
+    if window.uses_matrices(k):
+        matrices = _roll_matrices(window.shape[k], 1, activity.dtype)
+        return _multiply_along(jnp.tensordot(jnp.stack(share, -1), matrices, 1), activity, k)
     shifted = _shifter(window, activity, k, reach)
     moved = (part * shifted(t) for t, part in zip(range(-reach, reach + 1), share, strict=True))
     return reduce(jnp.add, moved).reshape(activity.shape)
 
 
-def _uses_matrices(axis: Axis) -> bool:
-    return axis.wraps and axis.size < MATRIX_BELOW
-
-
-def _roll_matrices(axis: Axis, reach: int, dtype: np.dtype) -> np.ndarray:
+def _roll_matrices(size: int, reach: int, dtype: np.dtype) -> np.ndarray:
     """[2 reach + 1, size, size] matrices that roll activity around a ring by -reach to reach cells."""
-    return np.stack([np.roll(np.eye(axis.size, dtype=dtype), t, axis=0) for t in range(-reach, reach + 1)])
+    return np.stack([np.roll(np.eye(size, dtype=dtype), t, axis=0) for t in range(-reach, reach + 1)])
 
 
 def _multiply_along(matrix: Array, activity: Array, k: int) -> Array:
@@ -292,10 +261,10 @@ def _shifter(window: Window, activity: Array, k: int, reach: int) -> Callable[[i
 
     Between products with matrices a heading layer is one row of cells; the caller restores the shape.
     """
-    if k == 0 and _uses_matrices(window.axes[2]):
+    if k == 0 and window.uses_matrices(2):
         activity = activity.reshape(len(activity), -1)  # rows of 11 to 17 cells are slow to shift
     size = activity.shape[k]
-    if window.axes[k].wraps:
+    if window.wraps(k):
         before = lax.slice_in_dim(activity, size - reach, size, axis=k)
         after = lax.slice_in_dim(activity, 0, reach, axis=k)
     else:
@@ -308,24 +277,18 @@ def _shifter(window: Window, activity: Array, k: int, reach: int) -> Callable[[i
 
 
 def _peak(window: Window, activity: Array, first: Array) -> tuple[Array, Array, Array]:
-    """Indices of the largest activity: heading, y, x."""
-    heading = _first_peak(window.axes[0], jnp.max(activity, axis=(1, 2)), first[0])
-    layer = lax.dynamic_index_in_dim(activity, heading, 0, keepdims=False)
-    y = _first_peak(window.axes[1], jnp.max(layer, axis=1), first[1])
-    row = lax.dynamic_index_in_dim(layer, y, 0, keepdims=False)
-    return heading, y, _first_peak(window.axes[2], row, first[2])
+    """Indices of the largest activity: heading, y, x; among ties along an axis, the torus's first cell."""
+    found = []
+    for k, ring in enumerate(window.rings):
+        marginal = jnp.max(activity, axis=(1, 2)[: 2 - k])
+        at = (first[k] + np.arange(len(marginal), dtype=np.int32)) % ring
+        tied = marginal >= jnp.max(marginal) * (1 - TIE)
+        found.append(jnp.argmin(jnp.where(tied, at, ring)).astype(jnp.int32))
+        activity = lax.dynamic_index_in_dim(activity, found[k], 0, keepdims=False)
+    heading, y, x = found
+    return heading, y, x
 
 
-def _first_peak(axis: Axis, marginal: Array, first: Array) -> Array:
-    """Index of the largest value of a marginal [size]; among ties, the first cell of the torus."""
-    at = (first + np.arange(axis.size, dtype=np.int32)) % axis.ring
-    tied = marginal >= jnp.max(marginal) * (1 - TIE)
-    return jnp.argmin(jnp.where(tied, at, axis.ring)).astype(jnp.int32)
-
-
-def _gaussian(width: int, sigma: Any) -> Any:
-    offset = np.arange(width) - width // 2
-    weight = (jnp if isinstance(sigma, jax.Array) else np).exp(
-        offset.astype(sigma.dtype) ** 2 / (-2 * sigma**2)
-    )
-    return weight / weight.sum()
+def _gaussian(width: int, sigma: float, dtype: np.dtype) -> np.ndarray:
+    weight = np.exp((np.arange(width) - width // 2).astype(float) ** 2 / (-2 * np.float64(sigma) ** 2))
+    return (weight / weight.sum()).astype(dtype)

@@ -70,19 +70,16 @@ def window_levels(config: NetworkConfig, dtype: np.dtype) -> tuple[Level, ...]:
     return (*(level for level in lower if level.windows * np.prod(level.window.shape) <= most), torus)
 
 
-def _empty_block(level: Level, dtype: np.dtype) -> Block:
-    """A block without activity."""
-    shape = (level.windows, *level.window.shape)
-    return Block(jnp.zeros(shape, dtype), jnp.zeros((level.windows, 3), jnp.int32))
-
-
 def point_activity(levels: tuple[Level, ...], pose: Array) -> Activity:
     """Unit activity at a pose [3], shared among its neighbour cells, at the smallest level."""
     smallest, dtype = levels[0].window, pose.dtype
     origin = smallest.origin_centred_on(pose)
     cells = smallest.deposit(jnp.zeros(smallest.shape, dtype), origin, pose, jnp.ones((), dtype))
-    above = tuple(_empty_block(level, dtype) for level in levels[1:])
-    return Activity((Block(cells[None], origin[None]), *above), jnp.int32(0))
+    blocks = [Block(cells[None], origin[None])]
+    for level in levels[1:]:
+        empty = jnp.zeros((level.windows, *level.window.shape), dtype)
+        blocks.append(Block(empty, jnp.zeros((level.windows, 3), jnp.int32)))
+    return Activity(tuple(blocks), jnp.int32(0))
 
 
 def to_full_torus(levels: tuple[Level, ...], activity: Activity) -> Array:
@@ -124,9 +121,9 @@ def _transfer(source: Level, block: Block, target: Level, origin: Array) -> Bloc
     ring = source.window.ring_sizes()[::-1]
 
     def cut(cells: Array, first: Array) -> Array:
-        for k, axis in enumerate(target.window.axes):
+        for k, wanted in enumerate(target.window.shape):
             size = source.window.shape[k]
-            at = (origin[2 - k] - first[2 - k] + np.arange(axis.size, dtype=np.int32)) % ring[k]
+            at = (origin[2 - k] - first[2 - k] + np.arange(wanted, dtype=np.int32)) % ring[k]
             part = jnp.take(cells, jnp.minimum(at, size - 1), axis=k)
             cells = jnp.where((at < size).reshape([-1 if a == k else 1 for a in range(3)]), part, 0.0)
         return cells
@@ -139,10 +136,10 @@ def _extent(shape: Window, block: Block) -> tuple[Array, Array, Array]:
     """[3] first and last cells with activity over x, y, heading of one window, and bool: there are any."""
     cells, dtype = block.activity > 0, block.activity.dtype
     low, high = [], []
-    for k, axis in zip((2, 1, 0), shape.axes[::-1], strict=True):
+    for k in (2, 1, 0):
         among = jnp.any(cells, axis=tuple(a for a in range(3) if a != k))
         low.append(jnp.argmax(among))
-        high.append(axis.size - 1 - jnp.argmax(among[::-1]))
+        high.append(shape.shape[k] - 1 - jnp.argmax(among[::-1]))
     first = block.origin.astype(dtype)
     return first + jnp.stack(low).astype(dtype), first + jnp.stack(high).astype(dtype), jnp.any(cells)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import shtab
 
 from ratslam.runs.settings.packaged import packaged_configs
-from tactile.base.files import require_new_file, require_own_folder
+from tactile.base.files import require_new_file
 
 if TYPE_CHECKING:
     from ratslam.runs.settings.run_config import RunConfig
@@ -60,10 +60,10 @@ class CommandParser(argparse.ArgumentParser):
             action.complete = shtab.FILE  # type: ignore[attr-defined]
         return action
 
-
-def own_folder(*marks: str) -> Callable[[Path], None]:
-    """The check of a folder that a command makes, or goes on with if one of the marks is in it."""
-    return lambda path: require_own_folder(path, marks)
+    def add_path(self, name: str, metavar: str, help: str, **options: Any) -> None:
+        """Adds an argument or an option for a file or folder; the name `-o` stands for `--output` too."""
+        names = ("-o", "--output") if name == "-o" else (name,)
+        self.add_argument(*names, type=Path, metavar=metavar, help=help, **options)
 
 
 class Commands:
@@ -109,11 +109,9 @@ class Commands:
         return parser
 
 
-def add_config(parser: argparse.ArgumentParser, what: str = "configuration file (YAML)") -> None:
+def add_config(parser: CommandParser, what: str = "configuration file (YAML)") -> None:
     """Adds the configuration, `--list` for those that come with the program, and `--set`."""
-    parser.add_argument(
-        "config", type=Path, metavar="CONFIG", help=f"{what}, or the name of a packaged one (--list)"
-    )
+    parser.add_path("config", "CONFIG", f"{what}, or the name of a packaged one (--list)")
     parser.add_argument("--list", action=_ListConfigs, help="list the packaged configurations and exit")
     add_set(parser)
 
@@ -123,17 +121,6 @@ def add_set(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="a.b=value", help="replace a setting; may be repeated"
     )
-
-
-def add_workers(parser: argparse.ArgumentParser, processes: int = 0) -> None:
-    """Adds `--workers`; 0 processes mean one a core."""
-    add_count(parser, "--workers", processes, "processes")
-
-
-def add_count(parser: argparse.ArgumentParser, name: str, default: int, help: str) -> None:
-    """Adds an option for a positive integer; the default 0 stands for the number of cores."""
-    help = f"{help} (default {default or 'the number of cores'})"
-    parser.add_argument(name, type=positive_integer, default=default, metavar="N", help=help)
 
 
 def positive_integer(text: str) -> int:

@@ -25,15 +25,11 @@ def add_commands(commands: Commands) -> None:
         "doctor", _doctor, "say what a recording, run or robot is, and what to do",
         "doctor my_bag -o mine.yaml", "look",
     )  # fmt: skip
-    doctor.add_argument(
-        "path", type=Path, metavar="FILE", help="recording, run directory, or with --live a configuration"
-    )
-    doctor.add_argument(
-        "-o", "--output", type=Path, metavar="YAML", help="write the configuration that reads the recording"
-    )
-    doctor.add_argument(
-        "--like", type=Path, metavar="MAP",
-        help="with -o: a run directory or map of the same sensor, whose view, cells and method to take, so "
+    doctor.add_path("path", "FILE", "recording, run directory, or with --live a configuration")
+    doctor.add_path("-o", "YAML", "write the configuration that reads the recording")
+    doctor.add_path(
+        "--like", "MAP",
+        "with -o: a run directory or map of the same sensor, whose view, cells and method to take, so "
         "that the recording can be localised in it or continue it",
     )  # fmt: skip
     doctor.add_argument(
@@ -44,14 +40,11 @@ def add_commands(commands: Commands) -> None:
     fit = commands.add(
         "fit", _fit, "measure wheels, whiskers and head from a record", "fit create_lab -o rig.yaml", "look"
     )
-    fit.add_argument(
-        "record", type=Path, metavar="RECORD",
-        help="recording, or the configuration (YAML, or name of a packaged one) that reads it",
+    fit.add_path(
+        "record", "RECORD",
+        "recording, or the configuration (YAML, or name of a packaged one) that reads it",
     )  # fmt: skip
-    fit.add_argument(
-        "-o", "--output", type=Path, metavar="YAML",
-        help="write the settings to a new file, for `include: [FILE]` in a configuration",
-    )  # fmt: skip
+    fit.add_path("-o", "YAML", "write the settings to a new file, for `include: [FILE]` in a configuration")
     fit.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the bootstrap (default 0)")
     add_set(fit)
 

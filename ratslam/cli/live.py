@@ -34,9 +34,7 @@ def add_commands(commands: Commands) -> None:
         help="address of the whisker head: usb, usb:VENDOR:PRODUCT[:SERIAL] (hexadecimal ids), or "
         "HOST[:PORT] of an emulator",
     )  # fmt: skip
-    live.add_argument(
-        "--localise", type=Path, metavar="MAP", help="localise in this map instead of making one"
-    )
+    live.add_path("--localise", "MAP", "localise in this map instead of making one")
     add_rerun(live)
 
     emulate = commands.add(

@@ -11,7 +11,7 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import INTERRUPTED, Commands, add_set, prepare_jax
+from ratslam.cli.common import INTERRUPTED, CommandParser, Commands, add_set, prepare_jax
 from ratslam.cli.run import add_rerun, open_target
 from tactile.base.errors import InputError, tell
 from tactile.base.files import require_new_file
@@ -29,7 +29,7 @@ def add_map(commands: Commands) -> None:
     _add_json(info)
     diff = kinds.add("diff", _diff, "say what differs between two maps", "map diff runs/square runs/again")
     _add_map(diff)
-    diff.add_argument("other", type=Path, metavar="MAP", help="the map to compare with it")
+    diff.add_path("other", "MAP", "the map to compare with it")
     _add_json(diff)
     undo = kinds.add(
         "undo", _undo, "remove a closure sequence from a map", "map undo runs/square 0 -o runs/undone.npz"
@@ -38,9 +38,7 @@ def add_map(commands: Commands) -> None:
     undo.add_argument(
         "sequence", type=int, metavar="SEQUENCE", help="its number, as `map info --json` and closures.csv say"
     )
-    undo.add_argument(
-        "-o", "--output", type=Path, metavar="MAP", help="the new map file (default: replaces the map file)"
-    )
+    undo.add_path("-o", "MAP", "the new map file (default: replaces the map file)")
     crop = kinds.add(
         "crop", _crop, "cut out a part of a map", "map crop runs/square --box 0,0,2,1 -o runs/part.npz"
     )
@@ -53,11 +51,11 @@ def add_map(commands: Commands) -> None:
     part.add_argument(
         "--piece", type=int, metavar="K", help="a piece, which nothing joins to the others, from 0"
     )
-    crop.add_argument("-o", "--output", type=Path, required=True, metavar="MAP", help="the new map file")
+    crop.add_path("-o", "MAP", "the new map file", required=True)
 
 
-def _add_map(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("map", type=Path, metavar="MAP", help="a run directory or a map file")
+def _add_map(parser: CommandParser) -> None:
+    parser.add_path("map", "MAP", "a run directory or a map file")
 
 
 def _add_json(parser: argparse.ArgumentParser) -> None:
@@ -143,15 +141,16 @@ def _diff(arguments: argparse.Namespace) -> int:
 def _undo(arguments: argparse.Namespace) -> int:
     output: Path | None = arguments.output
     prepare_jax()
-    from ratslam.runs.map_care import finish_undo, replaced_file, undo_sequence
+    from ratslam.runs.folder_change import finish_change
+    from ratslam.runs.map_care import replaced_file, undo_sequence
 
     if output is None:
         output = arguments.map = replaced_file(arguments.map)
-        finished = finish_undo(output)
+        finished = finish_change(output.parent)
         if finished is not None:
             folder = output.parent
             print(f"{folder}: the undo of sequence {finished}, which had been cut off, is complete")
-        if finished == arguments.sequence:
+        if finished == str(arguments.sequence):
             return 0
     saved = _read(arguments.map)
     rewritten = undo_sequence(saved, arguments.sequence, output)
@@ -162,9 +161,12 @@ def _undo(arguments: argparse.Namespace) -> int:
 
 
 def _crop(arguments: argparse.Namespace) -> int:
+    prepare_jax()
+    from ratslam.places.crop import keyframes_in_box, keyframes_of_piece, keyframes_of_steps
+    from ratslam.runs.map_care import Choose, crop_saved
+
     box, steps = arguments.box, arguments.steps
-    x0 = y0 = x1 = y1 = 0.0
-    first = last = ""
+    choose: Choose = partial(keyframes_of_piece, piece=arguments.piece)
     if box is not None:
         try:
             x0, y0, x1, y1 = (float(part) for part in box.split(","))
@@ -172,22 +174,13 @@ def _crop(arguments: argparse.Namespace) -> int:
             raise InputError("--box", repr(box), "four numbers X0,Y0,X1,Y1, m") from None
         if not (x0 < x1 and y0 < y1):  # nor with NaN
             raise InputError("--box", repr(box), "X0 < X1 and Y0 < Y1, m")
+        choose = partial(keyframes_in_box, box=(x0, y0, x1, y1))
     if steps is not None:
         first, colon, last = steps.partition(":")
         if not colon or not all(part.isdecimal() or not part for part in (first, last)):
             raise InputError("--steps", repr(steps), "A:B with whole numbers from 0")
+        choose = partial(keyframes_of_steps, first=int(first or 0), last=int(last or sys.maxsize))
     saved = _read(arguments.map)
-    from ratslam.places.crop import keyframes_in_box, keyframes_of_piece, keyframes_of_steps
-    from ratslam.runs.map_care import Choose, crop_saved
-
-    choose: Choose
-    if box is not None:
-        choose = partial(keyframes_in_box, box=(x0, y0, x1, y1))
-    elif steps is not None:
-        end = int(last) if last else sys.maxsize
-        choose = partial(keyframes_of_steps, first=int(first or 0), last=end)
-    else:
-        choose = partial(keyframes_of_piece, piece=arguments.piece)
     count = crop_saved(saved, choose, arguments.output)
     print(f"{arguments.output}: {count} of {saved.steps} steps")
     return 0
@@ -203,16 +196,14 @@ def add_localise(commands: Commands) -> None:
         "localise", _localise, "find a recording's poses in a saved map",
         "localise runs/whisker_maze another_day.yaml -o runs/found", "maps",
     )  # fmt: skip
-    localise.add_argument("map", type=Path, metavar="MAP", help="a run directory or its map.npz")
-    localise.add_argument(
-        "recording", type=Path, metavar="RECORDING",
-        help="configuration with the recording or simulation to localise, or a recording of the map's sensor "
+    localise.add_path("map", "MAP", "a run directory or its map.npz")
+    localise.add_path(
+        "recording", "RECORDING",
+        "configuration with the recording or simulation to localise, or a recording of the map's sensor "
         "(the method and its settings are those of the map)",
     )  # fmt: skip
     add_set(localise)
-    localise.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/RECORDING_in_MAP)"
-    )
+    localise.add_path("-o", "DIR", "new run directory (default runs/RECORDING_in_MAP)")
     add_rerun(localise)
 
 
@@ -248,20 +239,18 @@ def add_merge(commands: Commands) -> None:
         "merge", _merge, "make one map of the sessions in several",
         "merge runs/monday runs/tuesday -o runs/both", "maps",
     )  # fmt: skip
-    merge.add_argument("maps", type=Path, nargs="+", metavar="MAP", help="run directories or map files")
-    merge.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="MAP",
-        help="the new map: a file that ends in .npz, or a folder for it with its trajectory and graph",
-    )  # fmt: skip
+    merge.add_path("maps", "MAP", "run directories or map files", nargs="+")
+    help = "the new map: a file that ends in .npz, or a folder for it with its trajectory and graph"
+    merge.add_path("-o", "MAP", help, required=True)
     merge.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _merge(arguments: argparse.Namespace) -> int:
     prepare_jax()
-    from ratslam.runs.merge import merge_maps
+    from ratslam.runs.merge import describe_merge, merge_maps
 
     report = merge_maps(arguments.maps, arguments.output, tell)
-    print(json.dumps(report.to_json(), indent=2) if arguments.json else report.describe())
+    print(json.dumps(report, indent=2) if arguments.json else describe_merge(report))
     return 0
 
 
@@ -276,7 +265,7 @@ def add_path(commands: Commands) -> None:
     path = commands.add(
         "path", _path, "find the way on a saved map", "path runs/square --from here --to -0.1,0.8", "maps"
     )
-    path.add_argument("map", type=Path, metavar="MAP", help="run directory, or its map.npz")
+    path.add_path("map", "MAP", "run directory, or its map.npz")
     path.add_argument(
         "--from", dest="start", default="here", metavar="X,Y|EXPERIENCE|here",
         help="start: a point, m, such as -0.1,0.2, an experience, or the map's last pose (default)",
@@ -290,10 +279,7 @@ def add_path(commands: Commands) -> None:
         "--mode", choices=("time", "temporal"), default="time",
         help="least expected time (default), or RatSLAM's goal temporal map",
     )  # fmt: skip
-    path.add_argument(
-        "-o", "--output", type=Path, metavar="PNG", check=_require_new_picture,
-        help="draw the way to a new file",
-    )  # fmt: skip
+    path.add_path("-o", "PNG", "draw the way to a new file", check=_require_new_picture)
     path.add_argument("--json", action="store_true", help="print JSON")
 
 

@@ -10,7 +10,7 @@ from shutil import get_terminal_size
 from typing import TYPE_CHECKING
 
 from evaluation.report import PAGE_START
-from ratslam.cli.common import INTERRUPTED, Commands, add_config, prepare_jax, read_config
+from ratslam.cli.common import INTERRUPTED, CommandParser, Commands, add_config, prepare_jax, read_config
 from tactile.base.errors import InputError
 from tactile.base.files import require_new_file
 
@@ -23,7 +23,7 @@ def add_look(commands: Commands) -> None:
     watch = commands.add(
         "watch", _watch, "show the progress of a run in another process", "watch runs/square", "look"
     )
-    watch.add_argument("directory", type=Path, metavar="RUN_DIR", help="run directory, running or finished")
+    watch.add_path("directory", "RUN_DIR", "run directory, running or finished")
     watch.add_argument(
         "--every", type=float, default=2.0, metavar="SECONDS", help="time between updates (default 2)"
     )
@@ -36,7 +36,7 @@ def add_look(commands: Commands) -> None:
     score = commands.add(
         "score", _score, "score a run directory or the log of any SLAM system", "score runs/square", "look"
     )
-    score.add_argument("log", type=Path, metavar="LOG", help="run directory, or CSV with t, id, x, y, theta")
+    score.add_path("log", "LOG", "run directory, or CSV with t, id, x, y, theta")
     score.add_argument(
         "--mode", choices=("strict", "paper", "or", "literal"), default="strict",
         help="how the Experience Metric counts (default strict)",
@@ -49,21 +49,19 @@ def add_look(commands: Commands) -> None:
         "--metric", dest="metrics", action="append", metavar="NAME",
         help="a registered metric to compute too; may be repeated",
     )  # fmt: skip
-    score.add_argument(
-        "--relations", type=Path, metavar="CSV",
-        help="true relative poses (t1,t2,x,y,z,roll,pitch,yaw) for the Energy Metric",
-    )  # fmt: skip
+    score.add_path(
+        "--relations", "CSV", "true relative poses (t1,t2,x,y,z,roll,pitch,yaw) for the Energy Metric"
+    )
     score.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
     report = commands.add(
         "report", _report, "write a page (HTML) about a run, or several compared",
         "report runs/square -o report.html", "look",
     )  # fmt: skip
-    report.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR", help="run directory")
-    report.add_argument(
-        "-o", "--output", type=Path, default=Path("report.html"), metavar="HTML",
-        check=partial(require_new_file, replaces=PAGE_START),
-        help="the page; one that is there is replaced (default ./report.html)",
+    report.add_path("runs", "RUN_DIR", "run directory", nargs="+")
+    report.add_path(
+        "-o", "HTML", "the page; one that is there is replaced (default ./report.html)",
+        default=Path("report.html"), check=partial(require_new_file, replaces=PAGE_START),
     )  # fmt: skip
 
 
@@ -159,11 +157,11 @@ def add_run(commands: Commands) -> None:
     )  # fmt: skip
     add_config(run)
     add_run_directory(run)
-    run.add_argument(
-        "--continue", dest="resume", type=Path, metavar="MAP",
-        help="map to continue: a run directory, or a map file (.npz). The same recording goes on after the "
+    run.add_path(
+        "--continue", "MAP",
+        "map to continue: a run directory, or a map file (.npz). The same recording goes on after the "
         "last sample mapped; another begins a separate piece, joined once its views place it in the map, and "
-        "is refused in maps of methods other than `backend: recall`, which are one piece",
+        "is refused in maps of methods other than `backend: recall`, which are one piece", dest="resume",
     )  # fmt: skip
     run.add_argument("--full", action="store_true", help="print all figures, as `score` does")
     run.add_argument(
@@ -176,17 +174,15 @@ def add_run(commands: Commands) -> None:
         "simulate whisker_maze -o runs/session.mcap", "run",
     )  # fmt: skip
     add_config(simulate)
-    simulate.add_argument("-o", "--output", type=Path, required=True, metavar="MCAP", help="the new file")
+    simulate.add_path("-o", "MCAP", "the new file", required=True)
     simulate.add_argument(
         "--raw", action="store_true", help="record raw 2 kHz samples instead of contact features"
     )
 
 
-def add_run_directory(parser: argparse.ArgumentParser) -> None:
+def add_run_directory(parser: CommandParser) -> None:
     """Adds the option that names the run directory."""
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="new run directory (default runs/CONFIG)"
-    )
+    parser.add_path("-o", "DIR", "new run directory (default runs/CONFIG)")
 
 
 def add_rerun(parser: argparse.ArgumentParser) -> None:

@@ -29,29 +29,26 @@ def add_tools(commands: Commands) -> None:
         "recover", _recover, "repair a recording that was cut off",
         "tools recover runs/maze/session.mcap -o runs/whole.mcap",
     )  # fmt: skip
-    recover.add_argument("recording", type=Path, metavar="MCAP", help="the damaged recording")
-    recover.add_argument("-o", "--output", type=Path, required=True, metavar="MCAP", help="the new file")
+    recover.add_path("recording", "MCAP", "the damaged recording")
+    recover.add_path("-o", "MCAP", "the new file", required=True)
 
     convert = tools.add(
         "convert", _convert, "turn an OpenRatSLAM parameter file into a configuration",
         "tools convert config_irat.txt --recording irat_red.bag -o irat.yaml",
     )  # fmt: skip
-    convert.add_argument("parameters", type=Path, metavar="INI", help="the parameter file")
-    convert.add_argument(
-        "--recording", type=Path, metavar="FILE",
-        help="the bag or video to map (default ROOT.bag, where ROOT is `topic_root` of the parameter file)",
+    convert.add_path("parameters", "INI", "the parameter file")
+    convert.add_path(
+        "--recording", "FILE",
+        "the bag or video to map (default ROOT.bag, where ROOT is `topic_root` of the parameter file)",
     )  # fmt: skip
     to_file = "write to this file instead of standard output"
-    convert.add_argument("-o", "--output", type=Path, metavar="YAML", help=to_file)
+    convert.add_path("-o", "YAML", to_file)
 
     schema = tools.add(
         "schema", _schema, "print the JSON schema of configurations, for editors",
         "tools schema -o runs/schema.json",
     )  # fmt: skip
-    schema.add_argument(
-        "-o", "--output", type=Path, metavar="FILE",
-        check=partial(require_new_file, replaces=SCHEMA_START), help=to_file,
-    )  # fmt: skip
+    schema.add_path("-o", "FILE", to_file, check=partial(require_new_file, replaces=SCHEMA_START))
 
     tools.add("version", _version, "print the versions of ratslam, Python and JAX", "tools version")
 
@@ -131,23 +128,19 @@ def add_check(commands: Commands) -> None:
         "check", None, "check a backend, source, touch front end or metric", "check backend recall", "files"
     )
     kinds = Commands(check)
-    backend = kinds.add("backend", partial(_check, "backend"), "check a SLAM method", "check backend recall")
-    source = kinds.add(
-        "source", partial(_check, "source"), "check a source or recording format", "check source my_robot"
-    )
-    touch = kinds.add(
-        "touch",
-        partial(_check, "touch"),
-        "check a touch front end",
-        "check touch my_taxels --source my_array",
-    )
-    metric = kinds.add("metric", partial(_check, "metric"), "check a metric", "check metric my_error")
-    for parser in (backend, source, touch, metric):
+    for kind, what, example in (
+        ("backend", "a SLAM method", "recall"),
+        ("source", "a source or recording format", "my_robot"),
+        ("touch", "a touch front end", "my_taxels --source my_array"),
+        ("metric", "a metric", "my_error"),
+    ):
+        parser = kinds.add(kind, partial(_check, kind), f"check {what}", f"check {kind} {example}")
         parser.add_argument("name", metavar="NAME", help="name under which it is registered")
         parser.add_argument(
             "--set", action="append", default=[], metavar="settings.a=value",
             help="replace a setting of it; may be repeated",
         )  # fmt: skip
+    source, touch = kinds.parsers["source"], kinds.parsers["touch"]
     source.add_argument(
         "--touch", metavar="NAME",
         help="front end for readings that are not observations; its settings by --set touch.a=value",
@@ -200,12 +193,12 @@ def add_export(commands: Commands) -> None:
         "export", _export, "write a run as a standard file",
         "export runs/square -o runs/square.mcap", "files",
     )  # fmt: skip
-    export.add_argument("run", type=Path, metavar="RUN", help="the run directory")
-    export.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="FILE",
-        help="the new file: .mcap for ROS 2 tools, .tum trajectory, .g2o pose graph, .json or .graphml "
+    export.add_path("run", "RUN", "the run directory")
+    export.add_path(
+        "-o", "FILE",
+        "the new file: .mcap for ROS 2 tools, .tum trajectory, .g2o pose graph, .json or .graphml "
         "experiences, .yaml nav2 map, .nwb or .npz spikes of recorded pose cells, .csv their scores; a name "
-        "without a suffix becomes a ROS 2 bag folder",
+        "without a suffix becomes a ROS 2 bag folder", required=True,
     )  # fmt: skip
     export.add_argument(
         "--peak-rate", type=_rate, default=20.0, metavar="HZ",

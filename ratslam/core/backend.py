@@ -60,14 +60,6 @@ class PoseCellProbe(NamedTuple):
     energy: Callable[[Evidence], Array]
 
 
-class MergedRows(Protocol):
-    """A record of host arrays by which the kernel follows the map when rows of its memory are merged."""
-
-    @property
-    def rows(self) -> int:
-        """Number of rows thereafter."""
-
-
 class Map(Protocol):
     """The map on the host: takes one step at a time; poses are in the map frame.
 
@@ -90,9 +82,10 @@ class Map(Protocol):
         or None."""
         return None
 
-    def merge(self) -> MergedRows | None:
-        """Merges rows of the memory, or restores merged ones, and returns the record that the kernel needs to
-        follow; None if nothing is to be done. Called before `feedback`."""
+    def merge(self) -> Any:
+        """Merges rows of the memory, or restores merged ones, and returns the record of host arrays that the
+        kernel needs to follow, whose `rows` is their number thereafter; None if nothing is to be done. Called
+        before `feedback`."""
         return None
 
     def begin_piece(self) -> None:

@@ -107,29 +107,32 @@ class LocalisedPose(NamedTuple):
     mass: float
     log_odds: float
 
+    def complete(self, estimate: Estimate) -> Estimate:
+        """The estimate of a backend with this pose instead of its own."""
+        dtype = np.asarray(estimate.pose).dtype
+        return estimate._replace(
+            pose=self.pose.astype(dtype),
+            spread=np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).astype(dtype),
+            lost=np.bool_(self.state != Localisation.FOUND),
+            action=np.int32(Action.NONE),
+            place=np.int32(-1),
+        )
+
 
 class LocalisedCourse(Checkpointed):
-    """The states and poses of all steps of a session."""
+    """The poses and states of all steps of a session, and what `write_course` writes of them."""
 
     def __init__(self) -> None:
         self.pose = GrowableArray((3,), np.float64)
-        self._states = GrowableArray((), np.int64)
-        self._record = GrowableArray((3,), np.float64)
+        self.states = GrowableArray((), np.int64)
+        self.record = GrowableArray((3,), np.float64)
 
     def append(self, now: LocalisedPose) -> None:
         """Adds a step."""
         deviation = float(np.sqrt(max(np.linalg.eigvalsh(now.covariance[:2, :2])[1], 0.0)))
         self.pose.append(now.pose)
-        self._states.append(int(now.state))
-        self._record.append((now.mass, now.log_odds, deviation))
-
-    def states(self) -> np.ndarray:
-        """[T] the `Localisation` at each step."""
-        return self._states.rows.copy()
-
-    def write(self, path: Path) -> None:
-        """Writes the course as CSV."""
-        write_course(path, self._states.rows, self._record.rows)
+        self.states.append(int(now.state))
+        self.record.append((now.mass, now.log_odds, deviation))
 
 
 def pieces_of(states: np.ndarray) -> np.ndarray:

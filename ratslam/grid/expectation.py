@@ -15,6 +15,7 @@ import numpy as np
 
 from ratslam.grid.config import GridConfig
 from ratslam.grid.map import ContactLog
+from ratslam.grid.particles import placed
 from tactile.base.se2 import compose
 from tactile.base.types import Array
 from tactile.whisker_geometry import PlanarWhiskers
@@ -81,7 +82,8 @@ def draw_surfaces(
         place = compose(path[k], np.array([*log.point[k, whisker], 0.0]))
         rows, off = _near(centres, place, FAR * BLOB * config.footprint.blob_sd)
         met[rows] += np.exp(-(off**2).sum(axis=-1) / (2 * (BLOB * config.footprint.blob_sd) ** 2))
-    for place in _walls(path, log):
+    for k, (foot, normal) in log.walls().items():
+        place = compose(path[k], np.array([*foot, normal + np.pi / 2]))
         along, across = ALONG * config.footprint.along, ACROSS * config.footprint.across
         rows, off = _near(centres, place, FAR * along)
         c, s = np.cos(place[2]), np.sin(place[2])
@@ -93,19 +95,6 @@ def draw_surfaces(
     passed, driven = _free(config, whiskers, made, path, log)
     evidence = MET * met - PASSED * np.minimum(passed, MOST_PASSED) - DRIVEN * np.minimum(driven, MOST_DRIVEN)
     return made._replace(evidence=np.clip(evidence, -MOST, MOST))
-
-
-def _walls(path: np.ndarray, log: ContactLog) -> list[np.ndarray]:
-    """Places and directions [3] of the walls of the reports in the map."""
-    found = []
-    distance = np.hypot(*log.wall.T)
-    for k in np.flatnonzero((distance > 1e-6) & log.valid & log.contact.any(axis=1)).tolist():
-        normal = log.wall[k] / distance[k]
-        middle = log.point[k][log.contact[k]].mean(axis=0)
-        foot = middle + normal * (distance[k] - normal @ middle)
-        direction = np.arctan2(normal[1], normal[0]) + np.pi / 2
-        found.append(compose(path[k], np.array([*foot, direction])))
-    return found
 
 
 def _free(
@@ -211,7 +200,7 @@ class Expectation:
     def whisker_classes(self, pose: Array) -> Array:
         """[N, W] class of each whisker at poses [N, 3]."""
         dtype = pose.dtype
-        cell, inside = self._cells(_placed(pose, jnp.asarray(self.base, dtype)))
+        cell, inside = self._cells(placed(pose, jnp.asarray(self.base, dtype)))
         turned = (pose[:, 2:] + jnp.asarray(self.angle, dtype)[None]) * (HEADINGS / (2 * np.pi))
         heading = jnp.round(turned).astype(jnp.int32) % HEADINGS
         index = heading * self.side**2 + cell
@@ -225,7 +214,7 @@ class Expectation:
 
     def wall_classes(self, pose: Array, place: Array, direction: Array) -> Array:
         """[N] class of a wall at `place` [2] of base_link, with its direction there, at poses [N, 3]."""
-        cell, inside = self._cells(_placed(pose, place[None])[:, 0])
+        cell, inside = self._cells(placed(pose, place[None])[:, 0])
         cosine, sine = jnp.asarray(self.direction, pose.dtype)[:, cell]
         off = 2 * (pose[:, 2] + direction) - jnp.arctan2(sine, cosine)
         off = jnp.abs(off - 2 * np.pi * jnp.round(off / (2 * np.pi))) / 2
@@ -239,10 +228,3 @@ class Expectation:
         inside = jnp.all((at >= 0) & (at < self.side), axis=-1)
         at = jnp.where(inside[..., None], at, 0.0).astype(jnp.int32)
         return at[..., 1] * self.side + at[..., 0], inside
-
-
-def _placed(pose: Array, points: Array) -> Array:
-    """[N, K, 2] points [K, 2] of base_link at poses [N, 3]."""
-    c, s = jnp.cos(pose[:, 2:]), jnp.sin(pose[:, 2:])
-    right, up = points[None, :, 0], points[None, :, 1]
-    return jnp.stack([pose[:, :1] + c * right - s * up, pose[:, 1:2] + s * right + c * up], axis=-1)

@@ -7,8 +7,6 @@ maximum of 1, to be multiplied by its log-odds.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,45 +48,14 @@ def wall_direction(config: LikelihoodConfig, field: Array, angle: Array, precisi
     return jnp.log(1 - config.wall + config.wall * likely)
 
 
-CountedCells = Callable[[Array, Array], Array]
-"""Takes cells [N, W, G, 2] along whiskers and contacts [W]; gives bool [N, W, G], free points that count."""
-
-
-def all_cells(cell: Array, contact: Array) -> Array:
-    """Eq. 2 as printed: every point counts, also the tip of a whisker in contact."""
-    del contact
-    return jnp.ones(cell.shape[:-1], bool)
-
-
-def distinct_cells(cell: Array, contact: Array) -> Array:
-    """bool [N, W, G]: each cell along a whisker counts once in eq. 2, and not as free where its contact is.
-
-    Args:
-        cell: [N, W, G, 2] cells at the points of each whisker, from base to tip. contact: [W] bool.
-    """
-    same = jnp.all(cell[:, :, :, None] == cell[:, :, None], axis=-1)  # [N, W, G, G]
-    earlier = np.tri(cell.shape[2], k=-1, dtype=bool)
-    repeated = jnp.any(same & earlier[None, None], axis=-1)
-    return ~repeated & ~(same[..., -1] & contact[None, :, None])
-
-
-def printed_likelihood(
-    prior: float,
-    evidence: Array,
-    cell: Array,
-    contact: Array,
-    alive: Array,
-    counted: CountedCells = all_cells,
-) -> Array:
+def printed_likelihood(prior: float, evidence: Array, contact: Array, among: Array) -> Array:
     """[N] log-likelihood by eq. 1 and 2.
 
     Args:
-        evidence: [N, W, G] log-odds at the points along each whisker, from base to tip. cell: [N, W, G, 2]
-            their cells. contact: [W] bool, contacts, all at the tip. alive: [W] bool, whiskers that report.
-        counted: selects the free points that count.
+        evidence: [N, W, G] log-odds at the points along each whisker, from base to tip. contact: [W] bool,
+            contacts, all at the tip. among: [N or 1, W, G] bool, the free points that count.
     """
     chance = jnp.clip(jax.nn.sigmoid(evidence + _logit(prior)), 1e-6, 1 - 1e-6)
-    among = counted(cell, contact) & alive[None, :, None]
     clear = jnp.sum(jnp.where(among, jnp.log1p(-chance), 0.0), axis=(1, 2))
     return clear + jnp.log(chance[:, :, -1]) @ contact.astype(evidence.dtype)
 

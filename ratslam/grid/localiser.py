@@ -23,13 +23,13 @@ from jax import lax
 from ratslam.core.arrays import Checkpointed
 from ratslam.core.backend import Map
 from ratslam.core.estimates import (
-    Action,
     Estimate,
     GridDrawing,
     Localisation,
     LocalisedCourse,
     LocalisedPose,
     pieces_of,
+    write_course,
 )
 from ratslam.grid import particles
 from ratslam.grid.config import GridConfig
@@ -82,10 +82,10 @@ class GridLocaliser(Checkpointed, Map):
 
     def states(self) -> np.ndarray:
         """[T] the `Localisation` at each step."""
-        return self._course.states()
+        return self._course.states.rows.copy()
 
     def pieces(self) -> np.ndarray:
-        return pieces_of(self._course.states())
+        return pieces_of(self._course.states.rows)
 
     def grid(self) -> GridDrawing:
         """The finished map."""
@@ -93,8 +93,9 @@ class GridLocaliser(Checkpointed, Map):
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """State, mass and log-odds of every step as CSV, and the finished map."""
+        course = self._course
         return {
-            "localisation.csv": self._course.write,
+            "localisation.csv": lambda path: write_course(path, course.states.rows, course.record.rows),
             "grid.npz": lambda path: np.savez_compressed(path, **self._drawn._asdict()),
         }
 
@@ -111,14 +112,7 @@ class GridLocaliser(Checkpointed, Map):
         self._judge(share, odds, bool(evidence.failed))
         now = self.localisation()
         self._course.append(now)
-        dtype = np.asarray(estimate.pose).dtype
-        return estimate._replace(
-            pose=now.pose.astype(dtype),
-            spread=np.sqrt(np.maximum(np.diag(now.covariance), 0.0)).astype(dtype),
-            lost=np.bool_(now.state != Localisation.FOUND),
-            action=np.int32(Action.NONE),
-            place=np.int32(-1),
-        )
+        return now.complete(estimate)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The whole state, with what tells the finished map from others."""
@@ -193,12 +187,7 @@ class Search:
     """
 
     def __init__(
-        self,
-        config: GridConfig,
-        expected: Expectation,
-        free: np.ndarray,
-        count: int,
-        dtype: np.dtype,
+        self, config: GridConfig, expected: Expectation, free: np.ndarray, count: int, dtype: np.dtype
     ) -> None:
         self.config, self.expected, self.count, self.dtype = config, expected, count, dtype
         self.agreement = {name: values.astype(dtype) for name, values in counted_agreement().items()}

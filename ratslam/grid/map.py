@@ -43,6 +43,17 @@ class ContactLog(NamedTuple):
     point: np.ndarray
     wall: np.ndarray
 
+    def walls(self) -> dict[int, tuple[np.ndarray, float]]:
+        """By the number of each report with a wall, the place [2] on it where the mean contact projects, m,
+        and the direction of its normal, rad, in base_link."""
+        distance, found = np.hypot(*self.wall.T), {}
+        there = np.isfinite(distance) & (distance > 1e-6) & self.valid & self.contact.any(axis=1)
+        for k in np.flatnonzero(there).tolist():
+            normal, middle = self.wall[k] / distance[k], self.point[k][self.contact[k]].mean(axis=0)
+            place = middle + normal * (distance[k] - normal @ middle)
+            found[k] = place, float(np.arctan2(normal[1], normal[0]))
+        return found
+
 
 def contact_log(
     motion: np.ndarray, contact: np.ndarray, alive: np.ndarray, point: np.ndarray, wall: np.ndarray
@@ -101,6 +112,7 @@ def _footprints(
     made: list[_Footprint] = []
     before = np.zeros(log.contact.shape[1], bool)
     pending: list[_Footprint] = []
+    walls = log.walls()
     for k, pose in enumerate(path):
         contact = log.contact[k]
         if not log.valid[k]:
@@ -115,14 +127,10 @@ def _footprints(
             pending = []
         new = log.point[k][contact & ~before & ~log.turning[k]]
         pending += [(_at(pose, p), config.contact, config.blob_sd, np.nan) for p in new]
-        distance = np.hypot(*log.wall[k])
-        if np.isfinite(distance) and distance > 1e-6 and contact.any():
-            pending = []
+        if k in walls:
             # The wall goes through its nearest point; its edge is drawn where the contacts project on it.
-            normal, middle = log.wall[k] / distance, log.point[k][contact].mean(axis=0)
-            place = _at(pose, middle + normal * (distance - normal @ middle))
-            direction = pose[2] + np.arctan2(normal[1], normal[0]) + np.pi / 2
-            made.append((place, config.contact, config.blob_sd, float(direction)))
+            pending, (place, normal) = [], walls[k]
+            made.append((_at(pose, place), config.contact, config.blob_sd, pose[2] + normal + np.pi / 2))
         before = contact
     return made + pending
 

@@ -152,12 +152,6 @@ def assign_copies(offspring: Array) -> Resampling:
     return Resampling(ancestor, source, target, jnp.sum(offspring == 0).astype(jnp.int32))
 
 
-def identity(count: int) -> Resampling:
-    """No resampling: every particle remains."""
-    rank = jnp.arange(count, dtype=jnp.int32)
-    return Resampling(rank, rank, rank, jnp.int32(0))
-
-
 def copy_particles(
     config: ResamplingConfig, particles: Particles, drawn: Resampling, key: Array
 ) -> Particles:
@@ -250,18 +244,7 @@ class Genealogy(Checkpointed):
 
 EVIDENCE, COSINE, SINE = 0, 1, 2
 LAYERS = 3
-
-
-class Windows(NamedTuple):
-    """One window per particle: corner [N, 2] int32, first column and row, and size in cells."""
-
-    corner: Array
-    size: int
-
-
-def empty_maps(count: int, side: int, dtype: jnp.dtype) -> Array:
-    """[N, layers, side, side] empty maps; rows are y, columns x."""
-    return jnp.zeros((count, LAYERS, side, side), dtype)
+"""Layers of the maps [N, LAYERS, S, S] of all particles; rows are y, columns x."""
 
 
 def to_cells(point: Array, cell: float, side: int) -> Array:
@@ -269,35 +252,42 @@ def to_cells(point: Array, cell: float, side: int) -> Array:
     return point / cell + (side - 1) / 2
 
 
-def windows_around(place: Array, side: int, size: int) -> Windows:
-    """Windows of `size` x `size` cells around places [N, 2] in cells, moved to lie inside the map."""
-    size = min(size, side)
+def windows_around(place: Array, side: int, size: int) -> Array:
+    """[N, 2] int32 corners, first column and row, of windows of `size` x `size` cells, at most `side`, around
+    places [N, 2] in cells, moved to lie inside the map."""
     corner = jnp.floor(place).astype(jnp.int32) - (size // 2 - 1)
-    return Windows(jnp.clip(corner, 0, side - size), size)
+    return jnp.clip(corner, 0, side - size)
 
 
-def read_window(maps: Array, windows: Windows, layer: int) -> Array:
-    """[N, size, size] one layer of the maps inside the windows."""
+def read_window(maps: Array, corner: Array, size: int, layer: int) -> Array:
+    """[N, size, size] one layer of the maps inside the windows with these corners [N, 2]."""
 
     def read(rows: Array, corner: Array) -> Array:
-        return lax.dynamic_slice(rows[layer], (corner[1], corner[0]), (windows.size, windows.size))
+        return lax.dynamic_slice(rows[layer], (corner[1], corner[0]), (size, size))
 
-    return jax.vmap(read)(maps, windows.corner)
+    return jax.vmap(read)(maps, corner)
 
 
-def write_window(maps: Array, windows: Windows, layer: int, values: Array) -> Array:
+def write_window(maps: Array, corner: Array, layer: int, values: Array) -> Array:
     """The maps with one layer inside the windows replaced by values [N, size, size]."""
     zero = jnp.int32(layer)
 
     def write(rows: Array, corner: Array, value: Array) -> Array:
         return lax.dynamic_update_slice(rows, value[None], (zero, corner[1], corner[0]))
 
-    return jax.vmap(write)(maps, windows.corner, values)
+    return jax.vmap(write)(maps, corner, values)
 
 
-def to_window(place: Array, windows: Windows) -> Array:
+def to_window(place: Array, corner: Array) -> Array:
     """[N, K, 2] places in the windows, from places in the map; cells."""
-    return place - windows.corner[:, None, :].astype(place.dtype)
+    return place - corner[:, None, :].astype(place.dtype)
+
+
+def placed(pose: Array, points: Array) -> Array:
+    """[N, K, 2] points [K, 2] of base_link at poses [N, 3]."""
+    c, s = jnp.cos(pose[:, 2:]), jnp.sin(pose[:, 2:])
+    right, up = points.T[:, None]
+    return jnp.stack([pose[:, :1] + c * right - s * up, pose[:, 1:2] + s * right + c * up], axis=2)
 
 
 def interpolate(maps: Array, layer: int, place: Array) -> Array:

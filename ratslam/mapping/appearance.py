@@ -21,7 +21,7 @@ from ratslam.mapping.ground import NEAR, GainPrior
 from ratslam.mapping.odometry_calibration import NO_ESTIMATE, BiasEstimate, SectorFan
 from ratslam.recall.memory import NO_LIKENESS
 from ratslam.recall.observation_model import label_gains
-from ratslam.recall.signed_likelihood import ImagePairs, learn, log_odds, pack, project, stored_image, unpack
+from ratslam.recall.signed_likelihood import learn, log_odds, pack, project, stored_image, unpack
 from ratslam.recall.whisker_likelihood import (
     PixelLayout,
     estimate_background,
@@ -443,8 +443,7 @@ class SignedAppearance(_LearnedAppearance):
         row = np.arange(count)
         moved = (row + (count * APART[:, None]).astype(int)) % count
         apart = np.column_stack([np.tile(row, len(APART)), moved.ravel()])
-        known = ImagePairs(images[pairs[:, 0]], images[pairs[:, 1]])
-        self._likeness = pack(learn(images, known, apart))
+        self._likeness = pack(learn(images, images[pairs[:, :2].T], apart))
 
     def learned_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         model, images = unpack(self._likeness), self._image.rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat
 
@@ -16,7 +16,6 @@ from ratslam.network.config import PoseCellConfig
 from ratslam.recall.config import RecallConfig
 from tactile.base.settings import Settings
 
-BackendConfig = TypeVar("BackendConfig", bound=Settings)
 Start = Literal["here", "unknown"]
 """Where a session begins in a finished map: where the map ended, or anywhere."""
 
@@ -86,8 +85,3 @@ class GridLocaliseBackendConfig(GridBackendConfig):
 
     localise: LocaliseConfig = LocaliseConfig()
     """Localisation in a finished map."""
-
-
-def select_settings(config: Settings, kind: type[BackendConfig]) -> BackendConfig:
-    """The sections of `config` (for example a `RunConfig`) that are fields of `kind`."""
-    return kind(**{name: getattr(config, name) for name in kind.model_fields})

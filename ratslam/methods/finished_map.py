@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from pathlib import Path
 from typing import TypeVar
 
 from ratslam.core.arrays import fill_missing, with_prefix
@@ -15,26 +14,19 @@ from tactile.base.errors import InputError
 FinishedMap = TypeVar("FinishedMap", bound=Map)
 
 
-def map_file(config: LocaliseConfig) -> Path:
-    """The file of the map, also of one that is named by its run directory.
-
-    Raises:
-        InputError: the configuration names none.
-    """
-    if config.map is None:
-        raise InputError("localise.map", "missing", "the file of a map, such as map.npz of a run")
-    return config.map / "map.npz" if config.map.is_dir() else config.map
-
-
-def restore_map(path: Path, made: FinishedMap, method: str) -> FinishedMap:
-    """The map in a map file.
+def restore_map(config: LocaliseConfig, made: FinishedMap, method: str) -> FinishedMap:
+    """The map that a configuration names, by its file or its run directory.
 
     Args:
         made: a new map of a backend with the settings of the file. method: its value of `backend`.
 
     Raises:
-        InputError: the file cannot be read, was made with other settings, or holds a map without a step.
+        InputError: the configuration names none, or the file cannot be read, was made with other settings, or
+            holds a map without a step.
     """
+    if config.map is None:
+        raise InputError("localise.map", "missing", "the file of a map, such as map.npz of a run")
+    path = config.map / "map.npz" if config.map.is_dir() else config.map
     if not path.is_file():
         found = "neither a file nor a folder" if path.exists() else "no such file"
         cure = "put it back, or set localise.map to where it is"

@@ -20,7 +20,7 @@ from ratslam.grid import likelihoods, particles
 from ratslam.grid.config import GridConfig
 from ratslam.grid.contact_features import ContactFeatures, contact_features
 from ratslam.grid.map import GridMap
-from ratslam.grid.particles import COSINE, EVIDENCE, SINE, Particles
+from ratslam.grid.particles import COSINE, EVIDENCE, LAYERS, SINE, Particles
 from tactile.base.errors import InputError
 from tactile.base.types import Array, MotionKind, Observation
 from tactile.whisker_geometry import PlanarWhiskers
@@ -94,18 +94,11 @@ class GridBackend(Backend):
 
     Args:
         feelers: whisker geometry of the observations. side: of the map, m. dtype: of all floating state.
-        counted: selects the free points that count in eq. 2 (`likelihood.model: literal`).
     """
 
     def __init__(
-        self,
-        config: GridConfig,
-        feelers: PlanarWhiskers,
-        side: float,
-        dtype: Any = np.float64,
-        counted: likelihoods.CountedCells = likelihoods.all_cells,
+        self, config: GridConfig, feelers: PlanarWhiskers, side: float, dtype: Any = np.float64
     ) -> None:
-        self.counted = counted
         self.config, self.feelers, self.dtype = config, feelers, np.dtype(dtype)
         self.side = int(np.ceil(side / config.cell))
         self.whiskers = len(feelers.length)
@@ -114,13 +107,9 @@ class GridBackend(Backend):
         angle = np.arange(RIM_POINTS) * 2 * np.pi / RIM_POINTS
         rim = 0.85 * config.body * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         self.body = np.concatenate([np.zeros((1, 2)), rim]).astype(self.dtype)
-        self.blob_sd, self.free_sd = (
-            config.footprint.blob_sd / config.cell,
-            config.footprint.free_sd / config.cell,
-        )
-        blob, free, along = (
-            REACH * sd for sd in (config.footprint.blob_sd, config.footprint.free_sd, config.footprint.along)
-        )
+        sds = config.footprint.blob_sd, config.footprint.free_sd, config.footprint.along
+        self.blob_sd, self.free_sd, self.along = (sd / config.cell for sd in sds)
+        blob, free, along = (REACH * sd for sd in sds)
         reach = max(np.hypot(*self.free.T).max(initial=0.0) + free, config.body)
         tips = np.hypot(*feelers.points(np.ones(1))[:, 0].T).max(initial=0.0)
         self.near, self.far, self.long = (self._window(far) for far in (reach, tips + blob, along))
@@ -132,7 +121,7 @@ class GridBackend(Backend):
         first, key = jax.random.split(key)
         return GridState(
             particles.start(self.config.drift, first, count, self.dtype),
-            particles.empty_maps(count, self.side, self.dtype),
+            jnp.zeros((count, LAYERS, self.side, self.side), self.dtype),
             jnp.zeros((count, 2), self.dtype),
             jnp.int32(MotionKind.OTHER),
             jnp.zeros(self.whiskers, bool),
@@ -168,6 +157,16 @@ class GridBackend(Backend):
         after = GridState(swarm, maps, wall_directions, motion, touched, jax.random.key_data(key))
         return after, estimate, evidence
 
+    def counted(self, cell: Array, contact: Array) -> Array:
+        """The free points that count in eq. 2 (`likelihood.model: literal`): as printed every point, also the
+        tip of a whisker in contact.
+
+        Args:
+            cell: [N, W, G, 2] cells at the points of each whisker, from base to tip. contact: [W] bool.
+        """
+        del contact
+        return jnp.ones(cell.shape[:-1], bool)
+
     def new_map(self) -> GridMap:
         """An empty map."""
         return GridMap(self.config, self.feelers, self.side)
@@ -178,10 +177,11 @@ class GridBackend(Backend):
             cell = jnp.round(self._in_cells(pose, jnp.asarray(self.shafts)))
             evidence = particles.interpolate(state.maps, EVIDENCE, cell)
             shape = (len(pose), self.whiskers, SEGMENTS)
+            reporting = features.free | features.touching
+            among = self.counted(cell.reshape(*shape, 2), features.touching) & reporting[None, :, None]
             likelihood = likelihoods.printed_likelihood(
-                self.config.prior, evidence.reshape(shape), cell.reshape(*shape, 2),
-                features.touching, features.free | features.touching, self.counted,
-            )  # fmt: skip
+                self.config.prior, evidence.reshape(shape), features.touching, among
+            )
             return jnp.where(features.valid, likelihood, 0.0)
         points = jnp.concatenate([jnp.asarray(self.free), jnp.asarray(self.body)])
         evidence = particles.interpolate(state.maps, EVIDENCE, self._in_cells(pose, points))
@@ -214,35 +214,32 @@ class GridBackend(Backend):
     def _resample(
         self, swarm: Particles, share: Array, worth: Array, valid: Array, pick: Array, jitter: Array
     ) -> tuple[Particles, particles.Resampling]:
-        config = self.config.resampling
-        needed = (
-            worth < config.min_effective_share * self.config.particles
-            if config.schedule == "needed"
-            else valid
-        )
+        config, count = self.config.resampling, self.config.particles
+        needed = worth < config.min_effective_share * count if config.schedule == "needed" else valid
+        rank = jnp.arange(count, dtype=jnp.int32)
+        none = particles.Resampling(rank, rank, rank, jnp.int32(0))  # every particle remains
 
         def draw_particles() -> tuple[Particles, particles.Resampling]:
             drawn = particles.resample(config, share, pick)
             return particles.copy_particles(config, swarm, drawn, jitter), drawn
 
-        return lax.cond(needed, draw_particles, lambda: (swarm, particles.identity(self.config.particles)))
+        return lax.cond(needed, draw_particles, lambda: (swarm, none))
 
     def _update_maps(
         self, maps: Array, wall_directions: Array, pose: Array, features: ContactFeatures
     ) -> tuple[Array, Array, Array]:
         """Every particle's map and wall directions after the observation; bool: a contact lies outside."""
-        config, cell = self.config.footprint, self.config.cell
+        config = self.config.footprint
         middle = self._in_cells(pose, jnp.zeros((1, 2), self.dtype))
-        windows = particles.windows_around(middle[:, 0], self.side, self.near)
+        corner = particles.windows_around(middle[:, 0], self.side, self.near)
         amount = -config.free * jnp.repeat(features.free, len(FREE_POINTS)).astype(self.dtype)
-        place = particles.to_window(self._in_cells(pose, jnp.asarray(self.free)), windows)
-        footprint = likelihoods.gaussian_blobs(place, amount, self.free_sd, windows.size)
+        place = particles.to_window(self._in_cells(pose, jnp.asarray(self.free)), corner)
+        footprint = likelihoods.gaussian_blobs(place, amount, self.free_sd, self.near)
         if self.config.body:
-            body = likelihoods.disc(
-                particles.to_window(middle, windows)[:, 0], self.config.body / cell, windows.size
-            )
+            middle = particles.to_window(middle, corner)[:, 0]
+            body = likelihoods.disc(middle, self.config.body / self.config.cell, self.near)
             footprint -= jnp.where(features.valid, config.body, 0.0) * body
-        maps = self._add_footprint(maps, EVIDENCE, windows, footprint)
+        maps = self._add_footprint(maps, corner, footprint)
 
         met = jnp.any(features.new) | (features.wall & (config.wall != "blob"))
         maps, wall_directions = lax.cond(
@@ -258,45 +255,41 @@ class GridBackend(Backend):
         self, maps: Array, wall_directions: Array, pose: Array, features: ContactFeatures
     ) -> tuple[Array, Array]:
         """The maps and wall directions with contacts and a wall added."""
-        config, cell = self.config.footprint, self.config.cell
-        ends = self._in_cells(pose, features.point)
-        windows = particles.windows_around(
-            self._in_cells(pose, jnp.zeros((1, 2), self.dtype))[:, 0], self.side, self.far
-        )
+        config = self.config.footprint
+        middle = self._in_cells(pose, jnp.zeros((1, 2), self.dtype))
+        corner = particles.windows_around(middle[:, 0], self.side, self.far)
+        ends = particles.to_window(self._in_cells(pose, features.point), corner)
         amount = config.blob * features.new.astype(self.dtype)
-        footprint = likelihoods.gaussian_blobs(
-            particles.to_window(ends, windows), amount, self.blob_sd, windows.size
-        )
-        maps = self._add_footprint(maps, EVIDENCE, windows, footprint)
+        footprint = likelihoods.gaussian_blobs(ends, amount, self.blob_sd, self.far)
+        maps = self._add_footprint(maps, corner, footprint)
         if config.wall == "blob":
             return maps, wall_directions
         place = self._in_cells(pose, features.on_wall[None])
-        windows = particles.windows_around(place[:, 0], self.side, self.long)
-        place = particles.to_window(place, windows)[:, 0]
+        corner = particles.windows_around(place[:, 0], self.side, self.long)
+        place = particles.to_window(place, corner)[:, 0]
         direction = pose[:, 2] + features.direction
         if config.wall == "edge":
-            shape = likelihoods.wall_sector(
-                place, direction, config.along / cell, config.sector, windows.size
-            )
+            shape = likelihoods.wall_sector(place, direction, self.along, config.sector, self.long)
         else:
-            shape = likelihoods.wall_edge(
-                place, direction, config.along / cell, config.across / cell, windows.size
-            )
+            across = config.across / self.config.cell
+            shape = likelihoods.wall_edge(place, direction, self.along, across, self.long)
         shape = jnp.where(features.wall, shape, 0.0)
-        maps = self._add_footprint(maps, EVIDENCE, windows, config.edge * shape)
+        maps = self._add_footprint(maps, corner, config.edge * shape)
         for layer, part in ((COSINE, jnp.cos(2 * direction)), (SINE, jnp.sin(2 * direction))):
-            field = particles.read_window(maps, windows, layer) + shape * part[:, None, None]
-            maps = particles.write_window(maps, windows, layer, field)
+            field = particles.read_window(maps, corner, self.long, layer) + shape * part[:, None, None]
+            maps = particles.write_window(maps, corner, layer, field)
         pointing = jnp.stack([jnp.cos(4 * direction), jnp.sin(4 * direction)], axis=1)
         return maps, wall_directions + jnp.where(features.wall, pointing, 0.0)
 
-    def _add_footprint(self, maps: Array, layer: int, windows: particles.Windows, footprint: Array) -> Array:
+    def _add_footprint(self, maps: Array, corner: Array, footprint: Array) -> Array:
+        """The maps with a footprint [N, size, size] added to the evidence in windows with these corners."""
         most = self.config.footprint.max_log_odds
-        evidence = jnp.clip(particles.read_window(maps, windows, layer) + footprint, -most, most)
-        return particles.write_window(maps, windows, layer, evidence)
+        before = particles.read_window(maps, corner, footprint.shape[1], EVIDENCE)
+        evidence = jnp.clip(before + footprint, -most, most)
+        return particles.write_window(maps, corner, EVIDENCE, evidence)
 
     def _window(self, reach: float) -> int:
-        """Side length, cells, of a window that reaches `reach` m in every direction.
+        """Side length, cells, of a window that reaches `reach` m in every direction, or that of the map.
 
         Raises:
             InputError: the windows of all particles and whiskers would have too many cells.
@@ -306,15 +299,11 @@ class GridBackend(Backend):
             found = f"footprints that reach {reach:g} m, in cells of {self.config.cell:g} m"
             expected = f"{MAX_WINDOW_CELLS:.3g} cells around all whiskers of all particles"
             raise InputError("grid", found, expected, "smaller footprints, coarser cells or fewer particles")
-        return 2 * int(np.ceil(reach / self.config.cell)) + 2
+        return min(2 * int(np.ceil(reach / self.config.cell)) + 2, self.side)
 
     def _in_cells(self, pose: Array, points: Array) -> Array:
         """[N, K, 2] points [K, 2] of base_link in cells of the map."""
-        c, s = jnp.cos(pose[:, 2:]), jnp.sin(pose[:, 2:])
-        right, up = points.T[:, None]
-        x = pose[:, :1] + c * right - s * up
-        y = pose[:, 1:2] + s * right + c * up
-        return particles.to_cells(jnp.stack([x, y], axis=2), self.config.cell, self.side)
+        return particles.to_cells(particles.placed(pose, points), self.config.cell, self.side)
 
 
 def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.float64) -> GridBackend:
@@ -328,7 +317,7 @@ def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.fl
             "backend", "grid, for a recording without whiskers", "recall, or a recording with whiskers"
         )
     side = config.side or LIVE_SIDE
-    if config.particles * particles.LAYERS * np.ceil(side / config.cell) ** 2 > MAX_CELLS:
+    if config.particles * LAYERS * np.ceil(side / config.cell) ** 2 > MAX_CELLS:
         found = f"{config.particles} particles with maps of {side:g} m in cells of {config.cell:g} m"
         raise InputError(
             "grid", found, "2^31 cells in all", "fewer particles, coarser cells or a smaller map"

@@ -17,12 +17,11 @@ from ratslam.core.session import finite_values
 from ratslam.mapping.ground import SESSION_WEIGHTING
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.config import LocaliseBackendConfig
-from ratslam.methods.finished_map import map_file, restore_map
+from ratslam.methods.finished_map import restore_map
 from ratslam.methods.recall import RecallBackend
 from ratslam.network.pose_cells import Belief
 from ratslam.places.localiser import Localiser, Place
 from ratslam.places.map_views import MapViews
-from ratslam.recall import memory as recall_memory
 from ratslam.recall.memory import Memory
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
@@ -110,10 +109,9 @@ class LocaliseBackend(Backend):
         recall = self._recall
         odometry, view, visible, clean = finite_values(recall.dtype, observation)
         seen, view = recall.prepare(observation, view, visible)
-        memory = recall_memory.accumulate_motion(
-            state.memory, jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
-        )
-        due = recall_memory.is_motion_due(self._views.config, recall.cell, memory) | (state.seen == 0)
+        moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
+        memory = state.memory.accumulate_motion(moved)
+        due = memory.is_motion_due(self._views.config, recall.cell) | (state.seen == 0)
         is_keyframe = seen & due
         features = recall.features(view, observation)
 
@@ -153,9 +151,8 @@ def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype
         InputError: the map cannot be read, or was not made with these settings.
     """
     settings, recall = config.localise, RecallBackend(config, view_shape, dtype)
-    map = restore_map(map_file(settings), recall.new_map(), "recall")
+    map = restore_map(settings, recall.new_map(), "recall")
     if not map.kept_keyframes().count:
-        raise InputError(
-            str(settings.map), "a map without keyframes", "a map in which a session can be found"
-        )
+        expected = "a map in which a session can be found"
+        raise InputError(str(settings.map), "a map without keyframes", expected)
     return LocaliseBackend(recall, map, settings.log_odds or LOG_ODDS, settings.start == "here")

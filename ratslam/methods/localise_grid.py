@@ -18,7 +18,7 @@ from ratslam.grid.localiser import GridLocaliser, Hypotheses, Search
 from ratslam.grid.map import GridMap
 from ratslam.methods import grid
 from ratslam.methods.config import GridLocaliseBackendConfig
-from ratslam.methods.finished_map import map_file, restore_map
+from ratslam.methods.finished_map import restore_map
 from tactile.base.errors import InputError
 from tactile.base.types import Array, MotionKind, Observation
 from tactile.whisker_geometry import PlanarWhiskers
@@ -99,9 +99,8 @@ class GridLocaliseBackend(Backend):
         surfaces = draw_surfaces(config, made.feelers, made.side, path, made.contacts())
         free = surfaces.centres()[surfaces.evidence < DRIVEN]
         if not len(free):
-            raise InputError(
-                "localise.map", "a map without driven ground", "one in which a session can be found"
-            )
+            found = "a map without driven ground"
+            raise InputError("localise.map", found, "one in which a session can be found")
         expected = Expectation(surfaces, made.feelers, config.body)
         self._search = Search(config, expected, free, count, self.dtype)
         self._needed = log_odds + float(np.log(self._search.places())) + ALIKE
@@ -113,10 +112,10 @@ class GridLocaliseBackend(Backend):
         """Pose hypotheses all over the map, or where it ended. Nothing grows: `capacity` is not used."""
         del capacity
         first, key = jax.random.split(key)
-        start = self._start
-        known = (
-            self._search.begin(first) if start is None else self._search.begin_at(first, start, self._needed)
-        )
+        if self._start is None:
+            known = self._search.begin(first)
+        else:
+            known = self._search.begin_at(first, self._start, self._needed)
         none = jnp.zeros(self._whiskers, bool)
         return GridLocaliseState(known, jnp.int32(MotionKind.OTHER), none, jax.random.key_data(key))
 
@@ -161,6 +160,6 @@ def build(
         InputError: the map cannot be read, or was not made with these settings and whiskers.
     """
     settings, method = config.localise, grid.build(config.grid, feelers, dtype)
-    made = restore_map(map_file(settings), method.new_map(), "grid")
+    made = restore_map(settings, method.new_map(), "grid")
     here = settings.start == "here"
     return GridLocaliseBackend(made, settings.log_odds or LOG_ODDS, settings.particles, dtype, here)

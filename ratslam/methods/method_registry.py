@@ -20,7 +20,6 @@ from ratslam.methods.config import (
     GridLocaliseBackendConfig,
     LocaliseBackendConfig,
     RecallBackendConfig,
-    select_settings,
 )
 from ratslam.methods.grid import GridEvidence
 from ratslam.methods.localise import LocaliseEvidence, LocaliseOutcome
@@ -134,7 +133,7 @@ def backend_settings(name: str, config: Any) -> Settings:
     Raises:
         InputError: there is no such method, or its settings are wrong.
     """
-    entry = BACKENDS.get(name, "backend")
+    kind = BACKENDS.get(name, "backend").config_class
     if name in BACKENDS.builtin:
-        return select_settings(config, entry.config_class)
-    return read_settings(entry.config_class, config.backend_settings, "backend_settings")
+        return kind(**{section: getattr(config, section) for section in kind.model_fields})
+    return read_settings(kind, config.backend_settings, "backend_settings")

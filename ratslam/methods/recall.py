@@ -41,10 +41,9 @@ from ratslam.network.config import Network
 from ratslam.network.pose_cells import Belief
 from ratslam.places.map_views import MapViews, PieceTies
 from ratslam.recall import filter
-from ratslam.recall import memory as recall_memory
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.filter import RecallResult
-from ratslam.recall.memory import CroppedRows, MapFeedback, Memory, MergedRows, crop_rows
+from ratslam.recall.memory import CroppedRows, MapFeedback, Memory, MergedRows, init_memory
 from ratslam.recall.observation_model import (
     ObservationLikelihood,
     label_likelihood,
@@ -146,7 +145,7 @@ class RecallBackend(Backend):
         del key
         return RecallState(
             self.no_belief(capacity),
-            recall_memory.init_memory(self.recall, self.size, capacity, self.dtype, self.groups),
+            init_memory(self.recall, self.size, capacity, self.dtype, self.groups),
             jnp.zeros(3, self.dtype),
             jnp.ones((), self.dtype),
         )
@@ -183,20 +182,20 @@ class RecallBackend(Backend):
 
     def merge_rows(self, state: RecallState, merged: MergedRows) -> RecallState:
         """The memory of the keyframes that remain; mass of merged ones goes to those they are merged with."""
-        memory = recall_memory.merge_rows(state.memory, merged)
+        memory = state.memory.merge_rows(merged)
         return state._replace(
             memory=memory, belief=pose_cells.merge_rows(state.belief, merged.onto, merged.offset)
         )
 
     def begin_piece(self, state: RecallState) -> RecallState:
         """All is novelty; the health is that of the start."""
-        memory, health = recall_memory.begin_piece(state.memory), jnp.ones((), self.dtype)
+        memory, health = state.memory.begin_piece(), jnp.ones((), self.dtype)
         belief = jax.tree.map(jnp.zeros_like, state.belief)
         return state._replace(belief=belief, memory=memory, health=health)
 
     def crop_rows(self, state: RecallState, cropped: CroppedRows) -> RecallState:
         """The memory of a cropped map; mass of keyframes that are gone becomes novelty."""
-        memory = crop_rows(state.memory, cropped)
+        memory = state.memory.crop_rows(cropped)
         belief = pose_cells.lose_rows(state.belief, cropped.left)
         # Anchored at once, because the next feedback may be steps away.
         belief = self._anchor(memory, pose_cells.merge_rows(belief, cropped.rows.onto, cropped.rows.offset))
@@ -246,8 +245,8 @@ class RecallBackend(Backend):
         odometry, view, visible, clean = finite_values(self.dtype, observation)
         seen, view = self.prepare(observation, view, visible)
         moved = jnp.stack([odometry.dx, odometry.dy, odometry.dtheta])
-        memory = recall_memory.accumulate_motion(state.memory, moved)
-        is_keyframe = seen & recall_memory.is_keyframe_due(self.recall, self.cell, memory)
+        memory = state.memory.accumulate_motion(moved)
+        is_keyframe = seen & memory.is_keyframe_due(self.recall, self.cell)
         features = self.features(view, observation)
 
         travelled = jnp.hypot(odometry.dx, odometry.dy)

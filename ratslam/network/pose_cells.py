@@ -83,12 +83,9 @@ class ViewCells(NamedTuple):
     used: Array
 
 
-class Ties(NamedTuple):
-    """Ties of view cells [S, C] to the eight pose cells around each: index [8, S, C] into the flattened
-    network, and weight [8, S, C], float32."""
-
-    index: Array
-    weight: Array
+Ties = tuple[Array, Array]
+"""Ties of view cells [S, C] to the eight pose cells around each: index [8, S, C] into the flattened network,
+and weight [8, S, C], float32."""
 
 
 def start(network: Network, views: tuple[int, int]) -> Belief:
@@ -177,7 +174,7 @@ def tie(network: Network, shape: tuple[int, ...], cells: ViewCells) -> Ties:
         weighed = [share[k] if up else 1 - share[k] for k, up in enumerate((heading, y, x))]
         index.append((corner[0] * shape[1] + corner[1]) * shape[2] + corner[2])
         weight.append(cells.used * weighed[0] * weighed[1] * weighed[2])
-    return Ties(jnp.stack(index), jnp.stack(weight))
+    return jnp.stack(index), jnp.stack(weight)
 
 
 def activity_at(network: Network, belief: Belief, motion: Array, chosen: Array) -> Array:
@@ -200,9 +197,9 @@ def drive(network: Network, shape: tuple[int, ...], cells: ViewCells, mass: Arra
     """K v: the activity [H, Y, X] that view cells of mass [S, C], float32, give to their pose cells."""
 
     def add(k: Array, activity: Array) -> Array:
-        ties = _tie_block(network, shape, cells, k)
-        update = (ties.weight * _rows(k, mass)[None]).reshape(-1)
-        return activity.at[ties.index.reshape(-1)].add(update, mode="promise_in_bounds")
+        index, weight = _tie_block(network, shape, cells, k)
+        update = (weight * _rows(k, mass)[None]).reshape(-1)
+        return activity.at[index.reshape(-1)].add(update, mode="promise_in_bounds")
 
     activity = jnp.zeros(int(np.prod(shape)), jnp.float32)
     return lax.fori_loop(0, _blocks(cells), add, activity).reshape(shape)
@@ -212,9 +209,9 @@ def read(network: Network, cells: ViewCells, activity: Array) -> Array:
     """K'Y: the activity [S, C] at the view cells."""
 
     def fetch(k: Array, held: Array) -> Array:
-        ties = _tie_block(network, activity.shape, cells, k)
-        there = activity.reshape(-1).at[ties.index].get(mode="promise_in_bounds")
-        part = jnp.sum(ties.weight * there, axis=0)
+        index, weight = _tie_block(network, activity.shape, cells, k)
+        there = activity.reshape(-1).at[index].get(mode="promise_in_bounds")
+        part = jnp.sum(weight * there, axis=0)
         return lax.dynamic_update_slice_in_dim(held, part, k * part.shape[-1], axis=-1)
 
     return lax.fori_loop(0, _blocks(cells), fetch, jnp.zeros(cells.used.shape, jnp.float32))
@@ -225,7 +222,7 @@ def _tie_block(network: Network, shape: tuple[int, ...], cells: ViewCells, k: Ar
     each one amid the scatter that needs it, which takes twice the time."""
     none = jnp.zeros((8, *_rows(k, cells.x).shape), jnp.int32)
     block = jax.tree.map(partial(_rows, k), cells)
-    untied = Ties(none, none.astype(jnp.float32))
+    untied = none, none.astype(jnp.float32)
     return lax.cond(k >= 0, partial(tie, network, shape), lambda _: untied, block)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.core.backend import Evidence, Map
-from ratslam.core.estimates import Action, Estimate, Localisation, LocalisedPose, pieces_of, write_course
+from ratslam.core.estimates import Estimate, Localisation, LocalisedPose, pieces_of, write_course
 from ratslam.mapping.ground import (
     MAP_WEIGHTING,
     NO_MOTION,
@@ -175,20 +175,12 @@ class Localiser(Checkpointed, Map):
             self._view.append(self.place.map.appearance.view_of(observation))
             self._add_keyframe(evidence)
         now = self.localisation()
-        spread = np.sqrt(np.maximum(np.diag(now.covariance), 0.0))
         self._pose.append(now.pose)
         self._states.append(int(now.state))
         self._record.append(
             (now.mass, now.log_odds, PoseHypothesis(now.pose, now.covariance).deviations()[0])
         )
-        dtype = np.asarray(estimate.pose).dtype
-        return estimate._replace(
-            pose=now.pose.astype(dtype),
-            spread=spread.astype(dtype),
-            lost=np.bool_(now.state != Localisation.FOUND),
-            action=np.int32(Action.NONE),
-            place=np.int32(-1),
-        )
+        return now.complete(estimate)
 
     @property
     def compared(self) -> int:

@@ -2,7 +2,7 @@
 
 Each keyframe keeps the view and the pose in the map at which it was stored, as the view templates of RatSLAM
 keep a view and the packet's pose (Milford & Wyeth 2004; Ball et al. 2013, section 3). Between keyframes the
-odometry adds up; when it is long enough, the next view becomes a keyframe (`is_keyframe_due`). Where
+odometry adds up; when it is long enough, the next view becomes a keyframe (`Memory.is_keyframe_due`). Where
 keyframes are is decided by the map: its poses and what it has learned of the sensors come back as
 `MapFeedback`.
 """
@@ -65,6 +65,24 @@ class MergedRows(NamedTuple):
     def rows(self) -> int:
         """Number of rows thereafter."""
         return len(self.source)
+
+
+class CroppedRows(NamedTuple):
+    """Rows of the memory after a map was cropped.
+
+    Attributes:
+        rows: the rows that remain; those that do not are taken to be merged with any other. left: [N] bool,
+            former rows that remain. motion, length, turn: [3], m, rad: odometry from the newest row that
+            remains to the newest former one. elsewhere: the robot is in a piece of the map that is gone, so
+            that there is no such odometry.
+    """
+
+    rows: MergedRows
+    left: np.ndarray
+    motion: np.ndarray
+    length: float
+    turn: float
+    elsewhere: bool
 
 
 class Memory(NamedTuple):
@@ -179,6 +197,13 @@ class Memory(NamedTuple):
             bias=bias, turn_error=turn_error, since=since, angle=angle, scale=scale, likeness=likeness,
         )  # fmt: skip
 
+    def apply_map_feedback(self, feedback: MapFeedback) -> Memory:
+        """The memory with the feedback of a map, of an empty one as it is."""
+        if not len(feedback.poses):
+            return self
+        rows, values, likeness = self.pack_feedback(feedback)
+        return self.take_feedback((jnp.asarray(rows), jnp.asarray(values), jnp.asarray(likeness)))
+
     def first_keyframes(self, count: int) -> Memory:
         """The memory as if it held only its first `count` keyframes, and had seen no view before."""
         label = np.array(self.label)
@@ -186,9 +211,89 @@ class Memory(NamedTuple):
         return self._replace(
             count=jnp.int32(count),
             label=jnp.asarray(label),
-            distinct=jnp.int32(len(np.unique(label[label >= 0]))),
+            distinct=_distinct(label),
             before=jnp.zeros_like(self.before),
         )
+
+    def begin_piece(self) -> Memory:
+        """The memory of a robot that may be anywhere: no odometry leads to the next keyframe, and the next
+        view seen becomes one."""
+        return self._replace(
+            motion=jnp.zeros_like(self.motion),
+            length=jnp.zeros((), self.x.dtype),
+            turn=jnp.asarray(np.inf, self.x.dtype),
+            before=jnp.zeros_like(self.before),
+        )
+
+    def merge_rows(self, merged: MergedRows) -> Memory:
+        """The memory with these rows.
+
+        Raises:
+            ValueError: there are more rows than the memory holds.
+        """
+        count = merged.rows
+        if count > self.label.shape[0]:
+            raise ValueError(f"{count} keyframes do not fit into a memory of {self.label.shape[0]}")
+
+        def take(rows: Array) -> Array:
+            former = np.asarray(rows)
+            return _put(former[..., merged.source], rows) if former.size else jnp.array(former)
+
+        return self._replace(
+            view=_put(merged.view.T, self.view),
+            label=_put(merged.label, self.label, -1),
+            x=take(self.x), y=take(self.y), heading=take(self.heading),
+            cosine=take(self.cosine), sine=take(self.sine),
+            before=take(self.before),
+            count=jnp.array(count, jnp.int32),
+        )  # fmt: skip
+
+    def crop_rows(self, cropped: CroppedRows) -> Memory:
+        """The memory reduced to rows."""
+        dtype, merged = self.x.dtype, self.merge_rows(cropped.rows)
+        return merged._replace(
+            distinct=_distinct(np.asarray(merged.label)[: cropped.rows.rows]),
+            motion=jnp.asarray(compose(cropped.motion, np.asarray(self.motion)), dtype),
+            length=self.length + jnp.asarray(cropped.length, dtype),
+            turn=self.turn + jnp.asarray(cropped.turn, dtype),
+        )
+
+    def accumulate_motion(self, odometry: Array) -> Memory:
+        """Adds body-frame motion to the odometry since the newest keyframe (path integration between views).
+
+        Args:
+            odometry: [3] of one step, m, m, rad.
+        """
+        return self._replace(
+            motion=compose(self.motion, odometry),
+            length=self.length + jnp.hypot(odometry[0], odometry[1]),
+            turn=self.turn + jnp.abs(odometry[2]),
+        )
+
+    def is_motion_due(self, config: RecallConfig, cell: float) -> Array:
+        """bool: the robot has moved so far since the newest keyframe that a view is compared again.
+
+        Args:
+            cell: side of a pose cell, m: the unit of the lengths in `config`.
+        """
+        return (self.length >= config.frame_distance * cell) | (self.turn > config.frame_turn)
+
+    def is_keyframe_due(self, config: RecallConfig, cell: float) -> Array:
+        """bool: the present view becomes a keyframe, because the robot has moved far enough."""
+        moved = self.is_motion_due(config, cell)
+        return (self.count < self.label.shape[0]) & (moved | (self.count == 0))
+
+
+def _put(rows: np.ndarray, like: Array, fill: float = 0) -> Array:
+    """Rows [..., n] at the beginning of an array like another."""
+    full = np.full(like.shape, fill, like.dtype)
+    full[..., : rows.shape[-1]] = rows
+    return jnp.array(full)
+
+
+def _distinct(label: np.ndarray) -> Array:
+    """int32 number of known labels."""
+    return jnp.int32(len(np.unique(label[label >= 0])))
 
 
 def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype, groups: int = 0) -> Memory:
@@ -208,130 +313,13 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
     return Memory(
         view=jnp.zeros((size, capacity), jnp.int32) if levels else zeros(size, capacity),
         label=jnp.full(capacity, -1, jnp.int32),
-        x=zeros(capacity),
-        y=zeros(capacity),
-        heading=zeros(capacity),
-        cosine=zeros(capacity),
-        sine=zeros(capacity),
+        **{name: zeros(capacity) for name in ("x", "y", "heading", "cosine", "sine")},
         count=jnp.int32(0),
         distinct=jnp.int32(0),
-        pose=zeros(3),
-        motion=zeros(3),
-        length=zeros(),
-        turn=zeros(),
-        bias=zeros(),
-        turn_error=zeros(),
-        since=zeros(),
-        angle=zeros(),
-        scale=zeros(),
+        **{name: zeros(3) for name in ("pose", "motion")},
+        **{name: zeros() for name in ("length", "turn", "bias", "turn_error", "since", "angle", "scale")},
         likeness=zeros(*learned),
         before=zeros(len(sector_shifts(config)), capacity if touch else 0),
-    )
-
-
-def begin_piece(memory: Memory) -> Memory:
-    """The memory of a robot that may be anywhere: no odometry leads to the next keyframe, and the next view
-    seen becomes one."""
-    zero, due = jnp.zeros((), memory.x.dtype), jnp.asarray(np.inf, memory.x.dtype)
-    return memory._replace(
-        motion=jnp.zeros_like(memory.motion), length=zero, turn=due, before=jnp.zeros_like(memory.before)
-    )
-
-
-def apply_map_feedback(memory: Memory, feedback: MapFeedback) -> Memory:
-    """The memory with the feedback of a map, of an empty one as it is."""
-    if not len(feedback.poses):
-        return memory
-    rows, values, likeness = memory.pack_feedback(feedback)
-    return memory.take_feedback((jnp.asarray(rows), jnp.asarray(values), jnp.asarray(likeness)))
-
-
-def merge_rows(memory: Memory, merged: MergedRows) -> Memory:
-    """The memory with these rows.
-
-    Raises:
-        ValueError: there are more rows than the memory holds.
-    """
-    source, count = merged.source, merged.rows
-    if count > memory.label.shape[0]:
-        raise ValueError(f"{count} keyframes do not fit into a memory of {memory.label.shape[0]}")
-
-    def put(rows: np.ndarray, like: Array, fill: float = 0) -> Array:
-        """Rows [..., n] at the beginning of an array like another."""
-        full = np.full(like.shape, fill, like.dtype)
-        full[..., :count] = rows
-        return jnp.array(full)
-
-    def take(rows: Array) -> Array:
-        former = np.asarray(rows)
-        return put(former[..., source], rows) if former.size else jnp.array(former)
-
-    return memory._replace(
-        view=put(merged.view.T, memory.view),
-        label=put(merged.label, memory.label, -1),
-        x=take(memory.x), y=take(memory.y), heading=take(memory.heading),
-        cosine=take(memory.cosine), sine=take(memory.sine),
-        before=take(memory.before),
-        count=jnp.array(count, jnp.int32),
-    )  # fmt: skip
-
-
-def accumulate_motion(memory: Memory, odometry: Array) -> Memory:
-    """Adds body-frame motion to the odometry since the newest keyframe (path integration between views).
-
-    Args:
-        odometry: [3] of one step, m, m, rad.
-    """
-    return memory._replace(
-        motion=compose(memory.motion, odometry),
-        length=memory.length + jnp.hypot(odometry[0], odometry[1]),
-        turn=memory.turn + jnp.abs(odometry[2]),
-    )
-
-
-def is_keyframe_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
-    """bool: the present view becomes a keyframe, because the robot has moved far enough.
-
-    Args:
-        cell: side of a pose cell, m: the unit of the lengths in `config`.
-    """
-    moved = is_motion_due(config, cell, memory)
-    return (memory.count < memory.label.shape[0]) & (moved | (memory.count == 0))
-
-
-def is_motion_due(config: RecallConfig, cell: float, memory: Memory) -> Array:
-    """bool: the robot has moved so far since the newest keyframe that a view is compared again."""
-    return (memory.length >= config.frame_distance * cell) | (memory.turn > config.frame_turn)
-
-
-class CroppedRows(NamedTuple):
-    """Rows of the memory after a map was cropped.
-
-    Attributes:
-        rows: the rows that remain; those that do not are taken to be merged with any other. left: [N] bool,
-            former rows that remain. motion, length, turn: [3], m, rad: odometry from the newest row that
-            remains to the newest former one. elsewhere: the robot is in a piece of the map that is gone, so
-            that there is no such odometry.
-    """
-
-    rows: MergedRows
-    left: np.ndarray
-    motion: np.ndarray
-    length: float
-    turn: float
-    elsewhere: bool
-
-
-def crop_rows(memory: Memory, cropped: CroppedRows) -> Memory:
-    """The memory reduced to rows."""
-    dtype = memory.x.dtype
-    memory = merge_rows(memory, cropped.rows)
-    labels = np.asarray(memory.label)[: cropped.rows.rows]
-    return memory._replace(
-        distinct=jnp.asarray(len(np.unique(labels[labels >= 0])), jnp.int32),
-        motion=jnp.asarray(compose(cropped.motion, np.asarray(memory.motion)), dtype),
-        length=memory.length + jnp.asarray(cropped.length, dtype),
-        turn=memory.turn + jnp.asarray(cropped.turn, dtype),
     )
 
 
@@ -350,16 +338,11 @@ def frozen_memory(
         feedback: poses [N, 3] and view metric of the map. views: [N, D], labels: [N] as recall stores them.
         capacity: rows, at least N. groups: see `init_memory`.
     """
-    count = len(labels)
     empty = init_memory(config, views.shape[1], capacity, dtype, groups)
-    view = np.zeros(empty.view.shape, empty.view.dtype)
-    view[:, :count] = views.T
-    label = np.full(capacity, -1, np.int32)
-    label[:count] = labels
     filled = empty._replace(
-        view=jnp.asarray(view),
-        label=jnp.asarray(label),
-        count=jnp.int32(count),
-        distinct=jnp.int32(len(np.unique(labels[labels >= 0]))),
+        view=_put(views.T, empty.view),
+        label=_put(labels, empty.label, -1),
+        count=jnp.int32(len(labels)),
+        distinct=_distinct(labels),
     )
-    return apply_map_feedback(filled, feedback)
+    return filled.apply_map_feedback(feedback)

@@ -123,38 +123,27 @@ def _raw_log_odds(correlation: Array, a: Array, b: Array) -> Array:
     return (a * b - correlation / 2 * (a * a + b * b)).sum(axis=0)
 
 
-class ImagePairs(NamedTuple):
-    """n pairs of stored images [n, D] of one place."""
-
-    one: np.ndarray
-    other: np.ndarray
-
-    def part(self, rows: slice) -> ImagePairs:
-        """Some of them."""
-        return ImagePairs(self.one[rows], self.other[rows])
-
-
-def learn(images: np.ndarray, pairs: ImagePairs, apart: np.ndarray) -> TwoCovariances:
+def learn(images: np.ndarray, pairs: np.ndarray, apart: np.ndarray) -> TwoCovariances:
     """The model learned from a session.
 
     The calibration is fitted to the log-odds of each half of the pairs by the covariances of the other half.
 
     Args:
-        images: [N, D] stored, in order of time. pairs: confirmed pairs of one place. apart: [Q, 2] numbers of
-            images of pairs of different places, Q > 0.
+        images: [N, D] stored, in order of time. pairs: [2, P, D] confirmed pairs of one place. apart: [Q, 2]
+            numbers of images of pairs of different places, Q > 0.
     """
-    steps = ImagePairs(images[1:], images[:-1])
+    steps = np.stack([images[1:], images[:-1]])
     covariances = _covariances(images, steps, pairs)
-    kinds, scores = (steps, pairs), [np.zeros(len(kind.one)) for kind in (steps, pairs)]
+    kinds, scores = (steps, pairs), [np.zeros(kind.shape[1]) for kind in (steps, pairs)]
     for odd in (0, 1):
-        rest = [kind.part(np.s_[1 - odd :: 2]) for kind in kinds]
+        rest = [kind[:, 1 - odd :: 2] for kind in kinds]
         trial = _covariances(images, *rest)
         for score, kind in zip(scores, kinds, strict=True):
-            score[odd::2] = _raw_scores(trial, *kind.part(np.s_[odd::2]))
+            score[odd::2] = _raw_scores(trial, *kind[:, odd::2])
     same = np.concatenate(scores)
     weights = np.ones(len(same))
     compared = int(covariances.projection.any(axis=1).sum())
-    weights[: len(steps.one)] = min(compared / max(len(steps.one), 1), 1.0)
+    weights[: steps.shape[1]] = min(compared / max(steps.shape[1], 1), 1.0)
     different = _raw_scores(covariances, images[apart[:, 0]], images[apart[:, 1]])
     calibration = calibrate(same, weights, different)
     return covariances._replace(calibration=np.array(calibration))
@@ -165,7 +154,7 @@ def _raw_scores(model: TwoCovariances, one: np.ndarray, other: np.ndarray) -> np
     return _raw_log_odds(model.correlation[:, None], project(model, one.T), project(model, other.T))
 
 
-def _covariances(images: np.ndarray, steps: ImagePairs, pairs: ImagePairs) -> TwoCovariances:
+def _covariances(images: np.ndarray, steps: np.ndarray, pairs: np.ndarray) -> TwoCovariances:
     """The model with the prior calibration.
 
     A pixel that is dead in an image or never changes is left out. The covariance within a place is that of

@@ -85,26 +85,19 @@ def level_heights(level: np.ndarray) -> np.ndarray:
     return np.where((level > 0) & (level <= HEIGHTS), value, 0.0)
 
 
-class Background(NamedTuple):
-    """Distribution of pixels over all places.
-
-    Attributes:
-        touching: [G] share of pixels in contact, by group. heights: [G, HEIGHTS] distribution of their
-            heights, each row sums to 1.
-    """
-
-    touching: np.ndarray
-    heights: np.ndarray
+Background = tuple[np.ndarray, np.ndarray]
+"""Pixels over all places: share [G] of those in contact, by group, and the distribution [G, HEIGHTS] of their
+heights, of which each row sums to 1."""
 
 
 def estimate_background(images: np.ndarray, group: np.ndarray) -> Background:
-    """The distribution in images [N, D] of levels, with pixels in groups [D]."""
+    """The background in images [N, D] of levels, with pixels in groups [D]."""
     groups = int(group.max()) + 1
     cell = (group * LEVELS + images).reshape(-1)
     count = np.bincount(cell, minlength=groups * LEVELS).reshape(groups, LEVELS)
     silent, contact = count[:, 0], count[:, 1:DEAD]
     touching = (contact.sum(axis=1) + 1.0) / (silent + contact.sum(axis=1) + 4.0)
-    return Background(touching, (contact + 1.0) / (contact + 1.0).sum(axis=1, keepdims=True))
+    return touching, (contact + 1.0) / (contact + 1.0).sum(axis=1, keepdims=True)
 
 
 def estimate_variation(now: np.ndarray, then: np.ndarray) -> Variation:
@@ -138,8 +131,8 @@ def log_odds_table(common: Background, visits: Variation) -> np.ndarray:
     height = (np.arange(HEIGHTS) + 0.5) / HEIGHTS
     near = np.exp(-np.abs(height[:, None] - height) / visits.width)
     near = near / near.sum(axis=0)
-    log = np.zeros((len(common.touching), LEVELS, LEVELS))
-    for g, (touching, heights) in enumerate(zip(common.touching, common.heights, strict=True)):
+    log = np.zeros((len(common[0]), LEVELS, LEVELS))
+    for g, (touching, heights) in enumerate(zip(*common, strict=True)):
         again = (1 - visits.outliers) * near + visits.outliers * heights[:, None]
         log[g, 0, 0] = np.log((1 - visits.appears) / (1 - touching))
         log[g, 1:DEAD, 0] = np.log(visits.appears / touching)

@@ -52,7 +52,7 @@ def build_session(config: RunConfig, source: Source, ablation: Ablation = FULL) 
         seed=config.session.seed,
         reserve=config.session.reserve or rows,
         precision=config.session.precision,
-        probe=None if plan is None else plan.probe(),
+        probe=plan and plan.probe,
     )
 
 

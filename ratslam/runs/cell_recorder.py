@@ -30,19 +30,14 @@ Bins = tuple[np.ndarray, np.ndarray, int]
 
 
 class RecordingPlan(NamedTuple):
-    """cells: of the method. cell: [C] int32 chosen cells in the flattened network. bins: over which all cells
-    are summed, every `interval` steps; None without sums."""
+    """cells: of the method. cell: [C] int32 chosen cells in the flattened network. probe: of the session,
+    whose steps have the activity of the chosen cells [C], float32, and where all cells are summed what was
+    held of them. bins: over which all cells are summed; None without sums."""
 
     cells: PoseCellProbe
     cell: np.ndarray
+    probe: Probe
     bins: Bins | None = None
-    interval: int = 1
-
-    def probe(self) -> Probe:
-        """The probe of a session: its steps have the activity of the chosen cells [C], float32, and where all
-        cells are summed what was held of them."""
-        each = lambda state: self.cells.each(state, self.cell)  # noqa: E731
-        return Probe(each) if self.bins is None else Probe(each, self.cells.hold, self.interval)
 
 
 def plan_recording(config: RunConfig, source: Source, backend: Backend) -> RecordingPlan | None:
@@ -58,10 +53,10 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
     if cells is None:
         found = f"`backend: {config.backend}`, a method without pose cells"
         raise InputError("cells", found, "`backend: recall` or `backend: classic`", "or remove `cells`")
-    sums = config.cells.sums
-    plan = RecordingPlan(cells, choose_cells(config.cells.chosen, cells.shape, config.session.seed))
+    sums, cell = config.cells.sums, choose_cells(config.cells.chosen, cells.shape, config.session.seed)
+    probe = Probe(lambda state: cells.each(state, cell))
     if sums is None:
-        return plan
+        return RecordingPlan(cells, cell, probe)
     size = 8 * int(np.prod(cells.shape)) * (sums.bins**2 + sums.heading_bins)
     if size > LARGEST_SUMS:
         found = f"sums of {np.prod(cells.shape)} cells, which need {size / 2**30:.1f} GiB"
@@ -74,8 +69,8 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
         raise InputError("cells.sums.extent", found, "[x0, y0, x1, y1] of the binned rectangle, m")
     x0, y0, x1, y1 = extent
     x_edges, y_edges = np.linspace(x0, x1, sums.bins + 1), np.linspace(y0, y1, sums.bins + 1)
-    interval = max(1, round(source.rate_hz / sums.rate))
-    return plan._replace(bins=(x_edges, y_edges, sums.heading_bins), interval=interval)
+    probe = probe._replace(seldom=cells.hold, interval=max(1, round(source.rate_hz / sums.rate)))
+    return RecordingPlan(cells, cell, probe, (x_edges, y_edges, sums.heading_bins))
 
 
 def _true_extent(source: Source, least: float) -> tuple[float, float, float, float] | None:
@@ -99,7 +94,7 @@ BUFFERED = 32 * CHUNK
 
 
 class CellRecorder:
-    """Records the steps of a session whose probe is `plan.probe()`.
+    """Records the steps of a session whose probe is that of the plan.
 
     Its memory is that of the sums and of `BUFFERED` rows, however long the session is.
 
@@ -217,14 +212,11 @@ class CellSums:
         """The place bin (row by row) and the heading bin of a true pose, None outside."""
         if not np.isfinite(truth).all():
             return None
-        column, row = _bin(self._x_edges, truth[0]), _bin(self._y_edges, truth[1])
-        if column is None or row is None:
-            return None
+        at = []
+        for edges, value in ((self._x_edges, truth[0]), (self._y_edges, truth[1])):
+            if not edges[0] <= value <= edges[-1]:
+                return None
+            # The last bin holds its upper edge.
+            at.append(min(int(np.searchsorted(edges, value, side="right")), len(edges) - 1) - 1)
+        column, row = at
         return row * self._width + column, round(float(truth[2]) / (2 * np.pi) * self._turns) % self._turns
-
-
-def _bin(edges: np.ndarray, value: float) -> int | None:
-    """The bin between edges [n + 1] that holds a value, None outside; the last one holds its upper edge."""
-    if not edges[0] <= value <= edges[-1]:
-        return None
-    return min(int(np.searchsorted(edges, value, side="right")), len(edges) - 1) - 1

@@ -12,12 +12,11 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 from tactile.base.bounded import read_json
 from tactile.base.errors import InputError, InputErrors
-from tactile.base.files import errors_of, flush_to_disk, write_text_atomically
+from tactile.base.files import flush_to_disk, hidden_folder, write_text_atomically
 
 READY = ".change"
 """Folder of a complete change within the folder that it changes."""
@@ -40,7 +39,7 @@ def change_folder(folder: Path, what: str, last: str, change: Callable[[Path], N
         InputError: another process changes the folder, or an error of `change`, which names `folder`.
     """
     folder = folder.resolve()
-    with _alone(folder), _workplace(folder) as making:
+    with _alone(folder), hidden_folder(folder, folder, MAKING) as making:
         shown = making / FILES / folder.name
         shown.mkdir(parents=True)
         before = [file for file in folder.iterdir() if not file.name.startswith(".")]
@@ -92,12 +91,14 @@ def _read_record(folder: Path) -> dict[str, Any]:
     return read_json(folder / READY / RECORD, "the record of a change of this folder", parse)
 
 
-def finish_change(folder: Path) -> None:
-    """Puts the files of such a change in place."""
-    folder = folder.resolve()
-    with _alone(folder):
-        if unfinished_change(folder) is not None:
-            _put_in_place(folder)
+def finish_change(folder: Path) -> str | None:
+    """Puts the files of such a change in place; returns its name, None without one."""
+    what, folder = unfinished_change(folder), folder.resolve()
+    if what is not None:
+        with _alone(folder):
+            if unfinished_change(folder) is not None:
+                _put_in_place(folder)
+    return what
 
 
 def _put_in_place(folder: Path) -> None:
@@ -121,20 +122,6 @@ def _put_in_place(folder: Path) -> None:
         cure = "repeat the command to complete it"
         raise InputError(str(folder), found, "a folder whose files can be replaced", cure) from error
     shutil.rmtree(done, ignore_errors=True)
-
-
-@contextmanager
-def _workplace(folder: Path) -> Iterator[Path]:
-    """A hidden folder in which the change is made; errors of it name the folder."""
-    try:
-        making = Path(mkdtemp(dir=folder, prefix=MAKING))
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(folder)) from error
-    try:
-        with errors_of(folder, making):
-            yield making
-    finally:
-        shutil.rmtree(making, ignore_errors=True)
 
 
 @contextmanager

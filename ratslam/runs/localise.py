@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
-
-import numpy as np
 
 from evaluation.artifacts.closure_table import CHANGES, read_changes
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.core.estimates import Localisation
-from ratslam.grid.localiser import GridLocaliser
 from ratslam.methods.config import Start
 from ratslam.methods.method_registry import LOCALISING
-from ratslam.places.localiser import Localiser
-from ratslam.runs.build_session import open_observations
 from ratslam.runs.map_settings import check_same_fov
-from ratslam.runs.run import LAST_TASK, catch_interrupt, process_source
-from ratslam.runs.runner import Observer, open_runner
+from ratslam.runs.run import run
+from ratslam.runs.runner import Observer
 from ratslam.runs.saved_map import SavedMap, is_map
 from ratslam.runs.settings.run_config import RunConfig, SourceConfig
 from ratslam.runs.settings.strict_yaml import (
@@ -30,7 +26,7 @@ from ratslam.runs.settings.strict_yaml import (
     validate,
 )
 from robot.recordings.recording_config import RecordingConfig
-from tactile.base.errors import InputError, tell
+from tactile.base.errors import InputError
 
 NOT_LOCALISED = {
     "classic": "whose view templates say which view is nearest, and not how likely it is of another place",
@@ -131,32 +127,24 @@ def localise(
         InputError: the map, the source or the run directory cannot be used, or the sensor is not that of the
             map.
     """
-    warnings: list[str] = []
-    with (
-        open_observations(localising(config, saved), tell, warnings) as (completed, source),
-        open_runner(completed, source, directory, observers=observers, warnings=warnings) as runner,
-        catch_interrupt(LAST_TASK),
-    ):
-        interrupted = process_source(runner, source)
-        card = runner.finish(interrupted)
-        made = runner.session.map
-        assert isinstance(made, Localiser | GridLocaliser)
-        changes = read_changes(directory / CHANGES) if isinstance(made, Localiser) else []
-        lines = [_describe_course(made.states(), made.localisation().mass)]
-    return card, "\n".join([*lines, *(change.describe() for change in changes)]), interrupted
+    card, interrupted = run(localising(config, saved), directory, observers=observers)
+    file = directory / CHANGES  # maps of whiskers only
+    changes = read_changes(file) if file.exists() else []
+    lines = [_describe_course(directory / "localisation.csv"), *(change.describe() for change in changes)]
+    return card, "\n".join(lines), interrupted
 
 
-def _describe_course(states: np.ndarray, mass: float) -> str:
-    """The course in words, of a `Localisation` after each step [T] and the probability of the last pose."""
-    known = states == Localisation.FOUND
-    found = np.flatnonzero(known)
-    last = Localisation(int(states[-1])) if len(states) else Localisation.SEARCHING
-    state = last.name.lower().replace("_", " ")
-    if not len(found):
-        return f"not found in {len(states)} steps: {state}"
-    lost = int((np.diff(known.astype(int)) < 0).sum())
+def _describe_course(path: Path) -> str:
+    """The course in words, from the file with state and probability of every step."""
+    steps = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:]]
+    known = [state == Localisation.FOUND.name.lower() for _, state, *_ in steps]
+    _, state, mass, *_ = steps[-1]
+    state = state.replace("_", " ")
+    if not any(known):
+        return f"not found in {len(steps)} steps: {state}"
+    lost = sum(before and not now for before, now in pairwise(known))
     again = f", lost {lost} time{'s' * (lost > 1)}" if lost else ""
     return (
-        f"found after {found[0] + 1} of {len(states)} steps, known in {len(found)} of them{again}; "
-        f"at the end: {state}, probability {mass:.3f}"
+        f"found after {known.index(True) + 1} of {len(steps)} steps, known in {sum(known)} of them{again}; "
+        f"at the end: {state}, probability {float(mass):.3f}"
     )

@@ -19,10 +19,10 @@ from ratslam.mapping.map_solution import Obstacle
 from ratslam.methods.recall import RecallBackend
 from ratslam.places.crop import crop_map
 from ratslam.places.difference import difference, keyframe_content
-from ratslam.runs.folder_change import change_folder, finish_change, unfinished_change
+from ratslam.runs.folder_change import change_folder
 from ratslam.runs.map_results import rewrite_results
+from ratslam.runs.map_settings import flat_settings
 from ratslam.runs.saved_map import NAME, SavedMap, map_file, write_map
-from ratslam.runs.settings.changed_settings import flat_settings
 from ratslam.runs.settings.strict_yaml import dump
 from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
@@ -186,20 +186,6 @@ def replaced_file(path: Path) -> Path:
             raise InputError(str(file), "read-only", "a map that may be changed", f"`chmod u+w` it, {cure}")
         require_writable(file)
     return file
-
-
-def finish_undo(path: Path) -> int | None:
-    """Puts the files of an undo in their places that was killed when all of them were made.
-
-    Args:
-        path: of the map. Returns: the sequence that was undone, None if nothing was to be done.
-    """
-    folder = map_file(path).parent
-    sequence = unfinished_change(folder)
-    if sequence is None:
-        return None
-    finish_change(folder)
-    return int(sequence)
 
 
 def crop_saved(saved: SavedMap, choose: Choose, output: Path) -> int:

@@ -14,13 +14,7 @@ import numpy as np
 
 from evaluation.artifacts.closure_table import write_closure_pairs
 from evaluation.artifacts.run_reader import MERGE_REPORT as MERGED
-from evaluation.artifacts.run_reader import (
-    PIECES,
-    is_merged,
-    read_run,
-    read_session_steps,
-    write_pieces,
-)
+from evaluation.artifacts.run_reader import PIECES, is_merged, read_run, read_session_steps, write_pieces
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run
@@ -31,9 +25,8 @@ from evaluation.report import PAGE_START
 from evaluation.report.page import check_report_libraries, write_page
 from evaluation.report.run_report import read_run_report
 from ratslam.core.backend import Map
-from ratslam.runs.settings.changed_settings import changed_settings
 from ratslam.runs.settings.packaged import read_citation
-from ratslam.runs.settings.run_config import ScoreConfig
+from ratslam.runs.settings.run_config import ScoreConfig, changed_settings
 from tactile.base.errors import InputError
 from tactile.base.files import require_new_file, write_atomically, write_text_atomically
 

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ratslam.methods.method_registry import BACKENDS, LOCALISING
-from ratslam.runs.settings.changed_settings import flat_settings
 from ratslam.runs.settings.run_config import RunConfig
 from robot.recordings.video import SUFFIXES as VIDEO_SUFFIXES
 from robot.sources.source import Source
@@ -71,6 +70,19 @@ def _settings(config: RunConfig) -> dict[str, Any]:
     precision = {"session.precision": config.session.precision}
     settings = flat_settings({name: plain[name] for name in names}) | precision
     return {name: value for name, value in settings.items() if name != "keyframes.merge_stood"}
+
+
+def flat_settings(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Settings as a configuration file nests them, each by its dotted name; an empty section is a value.
+
+    Args:
+        before: what the names begin with.
+    """
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        section = isinstance(value, dict) and value
+        flat |= flat_settings(value, f"{before}{name}.") if section else {before + name: value}
+    return flat
 
 
 def _text(value: Any) -> str:
@@ -143,9 +155,9 @@ class Sensor(NamedTuple):
             geometry = {
                 f"touch.head.{name}": head[name] for name in head if name not in ("dead", "limit_deg")
             }
-            kind, made = WHISKER_HEAD, _sensor_settings("touch.image", touch.image)
+            kind, made = WHISKER_HEAD, flat_settings(touch.image.model_dump(mode="json"), "touch.image.")
         else:
-            kind, made = VIEWS, _view_settings(config)
+            kind, made = VIEWS, _views_of(config)[1]
         transform = made | {f"templates.{name}": value for name, value in templates.items()}
         transform = {
             name: value
@@ -213,7 +225,7 @@ def check_same_fov(where: str, of_map: RunConfig, other: RunConfig) -> None:
         where: the map, for the error.
     """
     fovs = [config.recall.sector_fov for config in (of_map, other)]
-    formats = [_format_of(config) for config in (of_map, other)]
+    formats = [_views_of(config)[0] for config in (of_map, other)]
     known = [fov for fov in fovs if not isinstance(fov, str)]
     same_format = formats[0] == formats[1] or "" in formats
     if not known or (abs(known[0] - known[1]) <= SAME_FOV if len(known) == 2 else same_format):
@@ -225,36 +237,21 @@ def check_same_fov(where: str, of_map: RunConfig, other: RunConfig) -> None:
     raise InputError(where, found, "a map of this sensor", cure)
 
 
-def _format_of(config: RunConfig) -> str:
-    """What the views of a recording are made of, in words; '' where it does not say."""
+def _views_of(config: RunConfig) -> tuple[str, dict[str, Any]]:
+    """What the views of a recording are made of, in words, '' where it does not say; and the settings by
+    which its images or ranges became views, where it is not one of views."""
     recording = config.recording
     if recording is None:
-        return ""
-    if recording.topics is not None:
-        return "topics of a bag"
-    if recording.file.suffix.lower() in VIDEO_SUFFIXES:
-        return "frames of a video"
-    return "a table" if recording.table.views is not None else ""
-
-
-def _sensor_settings(section: str, settings: Any) -> dict[str, Any]:
-    return {f"{section}.{name}": value for name, value in settings.model_dump(mode="json").items()}
-
-
-def _view_settings(config: RunConfig) -> dict[str, Any]:
-    """Settings by which a recording's images or ranges became views, where it is not one of views."""
-    recording = config.recording
-    if recording is None:
-        return {}
-    image = _sensor_settings("recording.image", recording.image)
+        return "", {}
+    image = flat_settings(recording.image.model_dump(mode="json"), "recording.image.")
     if recording.topics is not None:
         topic = recording.topics.views
         kept = {} if topic is None else topic.model_dump(include={"rows", "columns", "max_range", "heights"})
-        return image | {f"recording.topics.views.{name}": value for name, value in kept.items()}
+        return "topics of a bag", image | flat_settings(kept, "recording.topics.views.")
     if recording.file.suffix.lower() in VIDEO_SUFFIXES:
-        return image
+        return "frames of a video", image
     table = recording.table
     if table.views is None:
-        return {}
+        return "", {}
     shape = {f"recording.table.{name}": getattr(table, name) for name in ("rows", "columns")}
-    return shape | {"recording.table.views.max_range": table.views.max_range}
+    return "a table", shape | {"recording.table.views.max_range": table.views.max_range}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.recall import RecallBackend
 from ratslam.places.difference import overlap, remembered
-from ratslam.places.joining import Join, Stretches, join_all
+from ratslam.places.joining import Stretches, join_all
 from ratslam.places.map_views import MapViews
 from ratslam.places.union import renew_experiences, unite
 from ratslam.runs.estimate import START
@@ -29,151 +29,117 @@ from tactile.base.errors import InputError
 from tactile.base.files import make_new_file, new_folder
 
 
-class MergeReport(NamedTuple):
-    """What was merged.
-
-    Attributes:
-        maps: the inputs in the order of their steps in the merged map. joins: what joined pieces, in order,
-            with the numbers of the maps that had them. pieces: [n] for each piece of the merged map the
-            numbers of the maps with steps in it. steps: [n] of each map. keyframes: not merged, of the merged
-            map. before: the same of all maps together. settings: of the method, by name, that are not the
-            same in all maps, with the value in each; those of the first were taken.
-    """
-
-    maps: tuple[Path, ...]
-    joins: tuple[tuple[Join, Stretches, Stretches], ...]
-    pieces: tuple[tuple[int, ...], ...]
-    steps: tuple[int, ...]
-    keyframes: int
-    before: int
-    settings: dict[str, list[Any]]
-
-    def describe(self) -> str:
-        """Which maps were joined where, and what stayed apart, as text."""
-        lines = [f"{number + 1}  {path}, {self.steps[number]} steps" for number, path in enumerate(self.maps)]
-        for join, one, other in self.joins:
-            x, y, heading = join.start
-            sd_x, sd_y, sd_heading = join.sd
-            lines.append(
-                f"{_names(other)} joined to {_names(one)}, where it begins at {x:.2f} m, {y:.2f} m, "
-                f"{np.degrees(heading):.1f} degrees (sd {sd_x:.3f} m, {sd_y:.3f} m, "
-                f"{np.degrees(sd_heading):.1f} degrees); log-odds {join.log_odds[0]:.0f} and "
-                f"{join.log_odds[1]:.0f} (needed {join.needed[0]:.0f}); {join.closures} closures"
-            )
-        pieces = [_names(piece) for piece in self.pieces]
-        if not self.joins:
-            lines.append("Nothing in the views joins these maps: they stay pieces of the merged map.")
-        if len(pieces) > 1:
-            lines.append(f"{len(pieces)} pieces, of maps " + "; ".join(pieces))
-        lines.append(f"{self.keyframes} keyframes of {self.before}")
-        if self.settings:
-            lines.append(f"Made with different settings; the merged map has those of {self.maps[0]}:")
-        for name, (taken, *others) in self.settings.items():
-            values = (f"map {k}: {value}" for k, value in enumerate(others, 2) if value != taken)
-            lines.append(f"{name} {taken} ({', '.join(values)})")
-        return "\n".join(lines)
-
-    def to_json(self) -> dict[str, Any]:
-        """The report as JSON."""
-        return {
-            "maps": [str(path) for path in self.maps],
-            "steps": list(self.steps),
-            "joins": [
-                {
-                    "maps": [list(one), list(other)],
-                    "start": join.start.tolist(),
-                    "sd": join.sd.tolist(),
-                    "log_odds": list(join.log_odds),
-                    "needed": list(join.needed),
-                    "closures": join.closures,
-                }
-                for join, one, other in self.joins
-            ],
-            "pieces": [list(piece) for piece in self.pieces],
-            "keyframes": self.keyframes,
-            "keyframes_before": self.before,
-            "settings": self.settings,
-        }
-
-
 def merge_maps(
     paths: Sequence[Path], output: Path, report: Callable[[str], None] = lambda _: None
-) -> MergeReport:
+) -> dict[str, Any]:
     """Writes one map of several sessions with one sensor; the order of `paths` does not matter.
 
     Args:
         output: a new map file (`.npz`), or a new folder for it with its trajectory and graph. It appears
             complete, at the end. report: called with sentences about the progress.
 
+    Returns:
+        what was merged, as JSON. maps: the inputs in the order of their steps in the merged map. steps: of
+        each. joins: what joined pieces, in order (`Join`), with the numbers of the maps that had them.
+        pieces: for each piece of the merged map the numbers of the maps with steps in it. keyframes: not
+        merged, of the merged map; keyframes_before: of all maps together. settings: of the method, by name,
+        that are not the same in all maps, with the value in each; those of the first were taken.
+
     Raises:
         InputError: a map cannot be read or merged, or the output exists.
     """
     maps = sorted((read_map(path, report) for path in paths), key=lambda one: one.digest)
     check_mergeable(maps)
-    session, made = _open(maps[0])
-    backend = session.backend
+    session = maps[0].open_session()
+    made, backend = _keyframes_of(maps[0], session.map), session.backend
     assert isinstance(backend, RecallBackend)
-    steps, before = [maps[0].steps], made.kept_keyframes().count
-    owner = [0] * _stretches(made)
+    before, owner = made.kept_keyframes().count, [0] * _stretches(made)
     tried: set[tuple[Stretches, Stretches]] = set()
-    joins = _join(made, backend, tried, owner, report)
+    joins: list[dict[str, Any]] = []
+
+    def join() -> None:
+        for found in join_all(made, MapViews(backend, made.kept_keyframes()), tried, report):
+            joins.append(
+                {
+                    "maps": [sorted({owner[stretch] for stretch in piece}) for piece in found.stretches],
+                    "start": found.start.tolist(),
+                    "sd": found.sd.tolist(),
+                    "log_odds": list(found.log_odds),
+                    "needed": list(found.needed),
+                    "closures": found.closures,
+                }
+            )
+
+    join()
     for number, saved in enumerate(maps[1:], 1):
-        _, other = _open(saved)
-        steps.append(saved.steps)
+        other = _keyframes_of(saved, saved.open_session().map)
         before += other.kept_keyframes().count
         owner += [number] * _stretches(other)
         made = unite(made, other, backend.new_map())
         report(f"adding {saved.path}")
-        joins += _join(made, backend, tried, owner, report)
+        join()
     renew_experiences(made)
-    session.map, kept = made, made.kept_keyframes()
+    session.map, kept, steps = made, made.kept_keyframes(), [saved.steps for saved in maps]
     session.change_rows(kept.count, sum(steps), partial(backend.remember, kept))
     piece, owners = made.pieces(), np.repeat(np.arange(len(maps)), steps)
-    found = MergeReport(
-        tuple(saved.path for saved in maps),
-        tuple(joins),
-        tuple(tuple(np.unique(owners[piece == k]).tolist()) for k in range(int(piece.max()) + 1)),
-        tuple(steps),
-        made.kept_keyframes().count,
-        before,
-        differing_settings([saved.config for saved in maps]),
-    )
+    found = {
+        "maps": [str(saved.path) for saved in maps],
+        "steps": steps,
+        "joins": joins,
+        "pieces": [np.unique(owners[piece == k]).tolist() for k in range(int(piece.max()) + 1)],
+        "keyframes": made.kept_keyframes().count,
+        "keyframes_before": before,
+        "settings": differing_settings([saved.config for saved in maps]),
+    }
     _write(output, session, maps, found)
     return found
 
 
-def _join(
-    made: KeyframeMap,
-    backend: RecallBackend,
-    tried: set[tuple[Stretches, Stretches]],
-    owner: list[int],
-    report: Callable[[str], None],
-) -> list[tuple[Join, Stretches, Stretches]]:
-    joins = join_all(made, MapViews(backend, made.kept_keyframes()), tried, report)
-    return [(join, _owners(join.stretches[0], owner), _owners(join.stretches[1], owner)) for join in joins]
+def describe_merge(report: Mapping[str, Any]) -> str:
+    """Which maps were joined where, and what stayed apart, as text, of a report of `merge_maps`."""
+    lines = [
+        f"{number}  {path}, {steps} steps"
+        for number, (path, steps) in enumerate(zip(report["maps"], report["steps"], strict=True), 1)
+    ]
+    for join in report["joins"]:
+        one, other = map(_names, join["maps"])
+        (x, y, heading), (sd_x, sd_y, sd_heading) = join["start"], join["sd"]
+        lines.append(
+            f"{other} joined to {one}, where it begins at {x:.2f} m, {y:.2f} m, "
+            f"{np.degrees(heading):.1f} degrees (sd {sd_x:.3f} m, {sd_y:.3f} m, "
+            f"{np.degrees(sd_heading):.1f} degrees); log-odds {join['log_odds'][0]:.0f} and "
+            f"{join['log_odds'][1]:.0f} (needed {join['needed'][0]:.0f}); {join['closures']} closures"
+        )
+    pieces = [_names(piece) for piece in report["pieces"]]
+    if not report["joins"]:
+        lines.append("Nothing in the views joins these maps: they stay pieces of the merged map.")
+    if len(pieces) > 1:
+        lines.append(f"{len(pieces)} pieces, of maps " + "; ".join(pieces))
+    lines.append(f"{report['keyframes']} keyframes of {report['keyframes_before']}")
+    if report["settings"]:
+        lines.append(f"Made with different settings; the merged map has those of {report['maps'][0]}:")
+    for name, (taken, *others) in report["settings"].items():
+        values = (f"map {k}: {value}" for k, value in enumerate(others, 2) if value != taken)
+        lines.append(f"{name} {taken} ({', '.join(values)})")
+    return "\n".join(lines)
 
 
-def _owners(stretches: Stretches, owner: Sequence[int]) -> tuple[int, ...]:
-    return tuple(sorted({owner[stretch] for stretch in stretches}))
+def _names(maps: Sequence[int]) -> str:
+    """Maps by their numbers from 1."""
+    return " + ".join(str(number + 1) for number in maps)
 
 
 def _stretches(made: KeyframeMap) -> int:
     return int(made.kept_keyframes().begins.rows.sum()) + 1
 
 
-def _open(saved: SavedMap) -> tuple[Session, KeyframeMap]:
-    session = saved.open_session()
-    return session, _keyframes_of(saved, session.map)
-
-
-def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: MergeReport) -> None:
+def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: Mapping[str, Any]) -> None:
     """Writes the map file, or a folder with it, its settings, trajectory, graph and the report."""
     made, first = session.map, maps[0]
-    name = " + ".join(dict.fromkeys(saved.source.name for saved in maps))
+    source = replace(first.source, name=" + ".join(dict.fromkeys(saved.source.name for saved in maps)))
     estimate = START._replace(pose=made.trajectory()[-1])
 
     def write(file: Path) -> None:
-        source = replace(first.source, name=name)
         write_map(file, session, first.config, source, estimate=estimate)
 
     if output.suffix == ".npz":
@@ -182,13 +148,8 @@ def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: Mer
     with new_folder(output) as folder:
         write(folder / NAME)
         (folder / "config.yaml").write_text(dump(first.config), encoding="utf-8")
-        (folder / REPORT).write_text(json.dumps(report.to_json(), indent=2) + "\n", encoding="utf-8")
-        write_merged_results(folder, made, output.name, report.steps)
-
-
-def _names(maps: Sequence[int]) -> str:
-    """Maps by their numbers from 1."""
-    return " + ".join(str(number + 1) for number in maps)
+        (folder / REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        write_merged_results(folder, made, output.name, report["steps"])
 
 
 OTHERS = "maps of different sessions"

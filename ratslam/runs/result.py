@@ -11,13 +11,10 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.run_reader import read_run, read_scorecard
 from evaluation.cells.recording import NAME as CELLS
 from evaluation.cells.recording import CellRecording, read_recording
-from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.scorecard import Scorecard, render_health, render_warnings, scorecard_html
 from evaluation.plots.run_plots import run_plots
 from evaluation.report.verdict import describe_score, judge_map
@@ -72,6 +69,14 @@ class Result:
     Args:
         directory: of a scored run.
 
+    Attributes:
+        directory, scorecard: of the run. time: [T] of each step, s.
+        trajectory: [T, 3] final poses: x m, y m, heading rad; those of the map, or odometry if the map is
+            doubted. odometry: [T, 3] poses by odometry alone. truth: [T, 3] true poses, NaN where unknown;
+            None if never known.
+        health: how far input and map can be believed. warnings: about the input, a sentence each; () if it is
+            clean.
+
     Raises:
         InputError: it is not the directory of a scored run.
     """
@@ -79,27 +84,9 @@ class Result:
     def __init__(self, directory: str | os.PathLike[str]) -> None:
         self.directory = Path(directory).resolve()
         self.scorecard: Scorecard = read_scorecard(self.directory)
-        self._run: RunArrays = read_run(self.directory)
-
-    @property
-    def time(self) -> np.ndarray:
-        """[T] time of each step, s."""
-        return self._run.time
-
-    @property
-    def trajectory(self) -> np.ndarray:
-        """[T, 3] final poses: x m, y m, heading rad; those of the map, or odometry if the map is doubted."""
-        return self._run.final
-
-    @property
-    def odometry(self) -> np.ndarray:
-        """[T, 3] poses by odometry alone."""
-        return self._run.odometry
-
-    @property
-    def truth(self) -> np.ndarray | None:
-        """[T, 3] true poses, NaN where unknown; None if never known."""
-        return self._run.truth
+        run = read_run(self.directory)
+        self.time, self.trajectory, self.odometry, self.truth = run.time, run.final, run.odometry, run.truth
+        self.health, self.warnings = Health(run.doubt, run.unjudged, run.warnings), run.warnings
 
     @cached_property
     def graph(self) -> networkx.DiGraph:
@@ -119,16 +106,6 @@ class Result:
         """
         file = self.directory / CELLS
         return read_recording(file) if file.exists() else None
-
-    @property
-    def health(self) -> Health:
-        """How far input and map can be believed."""
-        return Health(self._run.doubt, self._run.unjudged, self.warnings)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """About the input, a sentence each; () if it is clean."""
-        return self._run.warnings
 
     @cached_property
     def interrupted(self) -> bool:
@@ -180,7 +157,7 @@ class Result:
         self.plot().savefig(picture, format="png")
         source = f"data:image/png;base64,{b64encode(picture.getvalue()).decode()}"
         image = f'<img src="{source}" alt="map of {escape(self.scorecard.name)}" style="max-width: 100%">'
-        verdict = judge_map(self._run.doubt, self._run.unjudged)
+        verdict = judge_map(self.health.doubt, self.health.reason)
         words = [f"{verdict.headline}. {verdict.reason} {describe_score(self.scorecard)}"]
         text = "".join(f"<p>{escape(line)}</p>" for line in words + render_warnings(self.scorecard))
         return f"<div>{image}{text}{scorecard_html(self.scorecard)}</div>"

@@ -174,9 +174,24 @@ class RunDirectory:
 
     def save_changes(self, map: Map, config: TouchConfig) -> None:
         """Writes changes.csv of a session that was localised in a map."""
-        if isinstance(map, Localiser):
-            rows = change_rows(map, changes_of(map, config))
-            self.file(CHANGES, lambda path: write_changes(path, rows))
+        if not isinstance(map, Localiser):
+            return
+        steps = map.visits().step
+        rows = [
+            ChangeRow(
+                x=float(change.position[0]),
+                y=float(change.position[1]),
+                extent=change.extent,
+                kind=change.kind,
+                evidence=change.evidence,
+                alarms=change.alarms,
+                passes=change.passes,
+                first_step=int(steps[change.keyframes[0]]),
+                last_step=int(steps[change.keyframes[-1]]),
+            )
+            for change in changes_of(map, config)
+        ]
+        self.file(CHANGES, lambda path: write_changes(path, rows))
 
 
 def true_grid(arena: Arena, grid: OccupancyGrid) -> GridTruth:
@@ -192,25 +207,6 @@ def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:
     """The places at which a localised session does not agree with its map, the surest first."""
     head, tallest = ur10_head(config.head), config.image.tallest
     return session_changes(localiser.place, localiser.visits(), head, tallest)
-
-
-def change_rows(localiser: Localiser, changes: Sequence[Change]) -> list[ChangeRow]:
-    """The lines of changes.csv."""
-    steps = localiser.visits().step
-    return [
-        ChangeRow(
-            x=float(change.position[0]),
-            y=float(change.position[1]),
-            extent=change.extent,
-            kind=change.kind,
-            evidence=change.evidence,
-            alarms=change.alarms,
-            passes=change.passes,
-            first_step=int(steps[change.keyframes[0]]),
-            last_step=int(steps[change.keyframes[-1]]),
-        )
-        for change in changes
-    ]
 
 
 class OnlineErrorLog:

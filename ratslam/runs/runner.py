@@ -34,11 +34,7 @@ from ratslam.runs.continuation import checkpoint_of, resume_session
 from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.map_results import score_and_plot, write_map_results
 from ratslam.runs.map_settings import Sensor
-from ratslam.runs.run_directory import (
-    OnlineErrorLog,
-    RunDirectory,
-    WhiskerView,
-)
+from ratslam.runs.run_directory import OnlineErrorLog, RunDirectory, WhiskerView
 from ratslam.runs.saved_map import NAME, describe_readings, map_file, read_map, write_map
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import dump
@@ -271,23 +267,21 @@ class Runner:
     ) -> None:
         """Tells the observers of these steps, and at the end of a chunk of the map."""
         count = self.session.steps
-        reports: list[StepReport] = []
         rows = zip(samples, observations, steps, odometry, strict=True)
-        for sample, observation, step, dead_reckoned in rows:
-            estimate = step.estimate
-            reports.append(
-                StepReport(
-                    number=count - len(steps) + len(reports),
-                    time=float(sample.time),
-                    observation=observation,
-                    odometry=dead_reckoned,
-                    pose=np.asarray(step.pose, float),
-                    place=int(estimate.place),
-                    previous=int(estimate.previous),
-                    lost=bool(estimate.lost),
-                    doubt=float(step.doubt),
-                )
+        reports = [
+            StepReport(
+                number=number,
+                time=float(sample.time),
+                observation=observation,
+                odometry=dead_reckoned,
+                pose=np.asarray(step.pose, float),
+                place=int(step.estimate.place),
+                previous=int(step.estimate.previous),
+                lost=bool(step.estimate.lost),
+                doubt=float(step.doubt),
             )
+            for number, (sample, observation, step, dead_reckoned) in enumerate(rows, count - len(steps))
+        ]
         report = None
         if count % CHUNK == 0:
             report = self._map_report()

@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -29,8 +29,6 @@ from tactile.frontend import TouchConfig
 from tactile.whisker_geometry import ur10_head
 from tactile.whisker_image import view_shape
 
-ODOMETRY = len(Odometry._fields)
-
 
 class Slam:
     """A session with its configuration and its touch front end. The kernel is compiled when it is made.
@@ -46,6 +44,8 @@ class Slam:
     Attributes:
         config: completed for the source. source: description of the readings. session: the backend's session.
         estimate: of the last step. warnings: about the source of the configuration, a sentence each.
+        cells: [C] float32 activity of the chosen pose cells (`cells.chosen`) after the last step; None before
+            the first, without `cells` in the configuration, and of a loaded map. A loop makes no sums.
 
     Raises:
         InputErrors: the configuration has errors.
@@ -72,7 +72,7 @@ class Slam:
         cells = config.cells and config.cells.model_copy(update={"sums": None})
         self.session = build_session(config.model_copy(update={"cells": cells}), observed)
         self.estimate = START
-        self._cells: np.ndarray | None = None
+        self.cells: np.ndarray | None = None
         self._frontend = observed.start() if isinstance(observed, TouchSource) else None
         self._blank = observation(
             Odometry(0.0, 0.0, 0.0, 0.0), view_shape=observed.view_shape, whiskers=observed.whiskers
@@ -87,12 +87,6 @@ class Slam:
     def steps(self) -> int:
         """Number of observations so far."""
         return self.session.steps
-
-    @property
-    def cells(self) -> np.ndarray | None:
-        """[C] float32 activity of the chosen pose cells (`cells.chosen`) after the last step; None before the
-        first, without `cells` in the configuration, and of a loaded map. A loop makes no sums."""
-        return self._cells
 
     def step(self, reading: Sample | Observation | Cycle | Whisk | Report) -> PoseEstimate:
         """Folds the next reading into the map; whisker readings go through the touch front end.
@@ -121,7 +115,7 @@ class Slam:
             step = self.session.step(_match_observation(observed, self._blank))
             entry = BACKENDS.get(self.config.backend, "backend")
             self.estimate = PoseEstimate.of_step(step, entry.outcome(step.evidence), self.warnings)
-            self._cells = step.probed
+            self.cells = step.probed
         return self.estimate
 
     def trajectory(self) -> np.ndarray:
@@ -183,20 +177,18 @@ def _match_observation(given: Observation, like: Observation) -> Observation:
         InputError: an array has another shape, another kind of numbers, or numbers that are not finite.
     """
     names = (*(f"odometry.{name}" for name in Odometry._fields), *Observation._fields[1:])
-    pairs = zip((*given.odometry, *given[1:]), (*like.odometry, *like[1:]), strict=True)
-    matched = [_match_array(name, value, other) for name, (value, other) in zip(names, pairs, strict=True)]
-    return Observation(Odometry(*matched[:ODOMETRY]), *matched[ODOMETRY:])
-
-
-def _match_array(name: str, value: Any, like: np.ndarray) -> np.ndarray:
-    found = np.asarray(value)
-    if found.shape != like.shape:
-        raise InputError(name, f"shape {found.shape}", f"{like.shape}, as described")
-    if not np.can_cast(found.dtype, like.dtype, "same_kind"):
-        raise InputError(name, f"numbers of type {found.dtype}", str(like.dtype))
-    if found.dtype.kind == "f" and not np.isfinite(found).all():
-        raise InputError(name, "a number that is not finite", "finite numbers", "mask what is missing")
-    return found.astype(like.dtype)
+    values, others = (*given.odometry, *given[1:]), (*like.odometry, *like[1:])
+    matched = []
+    for name, found, other in zip(names, map(np.asarray, values), others, strict=True):
+        if found.shape != other.shape:
+            raise InputError(name, f"shape {found.shape}", f"{other.shape}, as described")
+        if not np.can_cast(found.dtype, other.dtype, "same_kind"):
+            raise InputError(name, f"numbers of type {found.dtype}", str(other.dtype))
+        if found.dtype.kind == "f" and not np.isfinite(found).all():
+            raise InputError(name, "a number that is not finite", "finite numbers", "mask what is missing")
+        matched.append(found.astype(other.dtype))
+    odometry = len(Odometry._fields)
+    return Observation(Odometry(*matched[:odometry]), *matched[odometry:])
 
 
 def _describe_whiskers(info: SourceInfo, touch: TouchConfig) -> SourceDescription:

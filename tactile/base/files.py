@@ -183,30 +183,37 @@ def make_new_file(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 @contextmanager
+def hidden_folder(path: Path, inside: Path, prefix: str) -> Iterator[Path]:
+    """A folder of a context in the folder `inside`, removed at its end; errors of it name `path`."""
+    try:
+        folder = Path(mkdtemp(dir=inside, prefix=prefix))
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    try:
+        with errors_of(path, folder):
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """A hidden folder in which a context makes files; at its end it becomes the folder `path`.
 
     Raises:
         InputError: another program has made it meanwhile.
     """
-    try:
-        folder = Path(mkdtemp(dir=path.parent, prefix=f".{path.name}."))
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    try:
-        with errors_of(path, folder):
-            yield folder
-            folder.chmod(0o755)
-            if os.path.lexists(path):
-                raise _appeared(path)
-            try:
-                os.rename(folder, path)
-            except OSError as error:
-                if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
-                    raise _appeared(path) from None
-                raise
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with hidden_folder(path, path.parent, f".{path.name}.") as folder:
+        yield folder
+        folder.chmod(0o755)
+        if os.path.lexists(path):
+            raise _appeared(path)
+        try:
+            os.rename(folder, path)
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                raise _appeared(path) from None
+            raise
 
 
 def _appeared(path: Path) -> InputError:

@@ -15,12 +15,7 @@ from ratslam.network.config import Network, PoseCellConfig
 from ratslam.recall import observation_model
 from ratslam.recall.config import RecallConfig
 from ratslam.recall.filter import recognise
-from ratslam.recall.memory import (
-    MapFeedback,
-    accumulate_motion,
-    apply_map_feedback,
-    init_memory,
-)
+from ratslam.recall.memory import MapFeedback, init_memory
 
 CELL = 0.6
 
@@ -36,7 +31,7 @@ def remembered(config: RecallConfig, frames: int, size: int, dtype):
     memory = memory._replace(
         view=jnp.asarray(stream.random((size, capacity)), dtype), count=jnp.int32(frames - 1)
     )
-    return apply_map_feedback(memory, MapFeedback(poses, 0.01, 0.0, 5.0, np.pi / 18, 0.06)), poses
+    return memory.apply_map_feedback(MapFeedback(poses, 0.01, 0.0, 5.0, np.pi / 18, 0.06)), poses
 
 
 @pytest.mark.parametrize("shifts", [0, 3])
@@ -58,7 +53,7 @@ def test_one_recall(benchmark, frames, shifts, dtype):
     def replay(memory, belief):
         def recall(k, carry):
             memory, belief = carry
-            memory = accumulate_motion(memory, moved)
+            memory = memory.accumulate_motion(moved)
             motion = memory.corrected_motion()
             weighed = observation_model.view_likelihood(config, CELL, memory, views[k % 64])
             belief, _ = recognise(config, network, memory, belief, motion, weighed, config.local)

@@ -85,8 +85,8 @@ def _permuted_together(seed: int) -> Functions:
     tie, excite = pose_cells.tie, pose_cells.excite
 
     def tie_moved(network: Network, shape: tuple[int, ...], cells: ViewCells) -> Ties:
-        ties = tie(network, shape, cells)
-        return ties._replace(index=jnp.asarray(_order(seed, shape), jnp.int32)[ties.index])
+        index, weight = tie(network, shape, cells)
+        return jnp.asarray(_order(seed, shape), jnp.int32)[index], weight
 
     def excite_moved(network: Network, activity: Array) -> Array:
         order = _order(seed, activity.shape)

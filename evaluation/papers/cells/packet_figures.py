@@ -30,8 +30,8 @@ from evaluation.papers.cells.panels import (
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config
 from evaluation.papers.figure import Figure, Task
 from evaluation.plots import style
+from evaluation.studies.network_batch import CellSets, walk
 from evaluation.studies.study_course import StudyCourse, expected_poses, read_course
-from ratslam.classic.batch import CellSets, Network, walk
 from ratslam.classic.config import rings, units
 from ratslam.core.compilation import prepare_precision
 from robot.sources.in_memory import load_into_memory
@@ -161,7 +161,8 @@ def _packets(study: StudyCourse) -> np.ndarray:
     network = study.config.excite_sigma, study.config.inhibit_sigma, study.config.global_inhibition, 1.0
     speed, heading = np.array(list(LEVELS.values())).T
     # `CellSets` scales the noise of a step; over a step the white noise of a second is larger.
-    sets = CellSets(Network(*(np.full(count, each) for each in network)), speed * np.sqrt(RATE), heading)
+    columns = [*(np.full(count, each) for each in network), speed * np.sqrt(RATE), heading]
+    sets = CellSets(*columns)
     tracks = walk(study.config, sets, study.course, study.chosen)
     wrapped = np.concatenate([track.pose for track in tracks], axis=1)
     start = np.broadcast_to(ring // 2, (count, 1, 3))

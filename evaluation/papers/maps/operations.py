@@ -125,8 +125,8 @@ class Methods:
             InputError: the maps cannot be merged.
         """
         merged = merge_maps([made.path for made in maps], path)
-        begins = np.cumsum([0, *merged.steps[:-1]]).tolist()
-        begin = {at.parent: first for at, first in zip(merged.maps, begins, strict=True)}
+        begins = np.cumsum([0, *merged["steps"][:-1]]).tolist()
+        begin = {Path(at).parent: first for at, first in zip(merged["maps"], begins, strict=True)}
         order = np.concatenate([begin[made.path] + made.order for made in maps])
         session = read_map(path).open_session()
         truth = np.concatenate([made.arrays.truth for made in maps])

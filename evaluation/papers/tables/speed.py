@@ -1,12 +1,8 @@
-"""Tables of speed, µs: a pose-cell step by size of the network, and steps of many networks and sessions.
+"""The table of speed, µs: a pose-cell step by size of the network.
 
-The speed table times a step in replay beside `_NumpyNetwork`, the baseline of all stated speeds. All columns
+It times a step in replay beside `_NumpyNetwork`, the baseline of all stated speeds. All columns
 of a row are timed in turns on one core, so that they share its state; only ratios carry over to other
 machines.
-
-The batch table times networks, parameter sets in one call and whole sessions in one call, on the processor
-and, if JAX has one, on the GPU beside it. On a GPU all sets and sessions are computed at once; on the
-processor sets in blocks that fit into its cache, and sessions one after another.
 """
 
 from __future__ import annotations
@@ -14,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from itertools import count
 from typing import Any
 
 import jax
@@ -22,19 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import circulant
 
-from evaluation.papers.tables.cycles import SESSIONS
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from ratslam.classic import batch, pose_cells
+from ratslam.classic import pose_cells
 from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.levels import window_levels
 from ratslam.classic.pose_cells import PoseCells
 from ratslam.core.compilation import prepare_precision
-from ratslam.methods.recall import RecallBackend
-from ratslam.methods.session_batch import Recording, RecordingSession, SessionBatch
-from ratslam.runs.build_session import build_session, open_observations
-from ratslam.runs.settings.run_config import load_config
-from robot.sources.in_memory import load_into_memory
-from robot.touch_source import observation_of
 from tactile.base.types import Odometry
 
 SIZES = (11, 21, 41, 61, 101, 201)
@@ -187,105 +175,3 @@ def _convolve(p: np.ndarray, along: list[np.ndarray]) -> np.ndarray:
     p = np.tensordot(along[0], p, axes=(1, 0))
     p = np.einsum("ab,kbi->kai", along[1], p, optimize=True)
     return p @ along[2].T
-
-
-BATCH_SIZES = 21, 61, 201
-"""Cells along one side of the single networks."""
-FEW = 200
-"""Steps of a call with many sets."""
-EVERY = 5
-"""Steps from one view to the next."""
-RECORDED = 4
-"""Different sessions that a batch repeats."""
-SINGLE = 400
-"""Steps of a single network."""
-
-
-def batch_table(sets: int, sessions: int, steps: int, rounds: int) -> Iterator[str]:
-    """The lines of the table, each as soon as it is timed.
-
-    Args:
-        sets, sessions: number in one call on a GPU; on the processor a fifth of the sets and `RECORDED`
-            sessions, as its time for each does not depend on their number. steps: of a session. rounds:
-            repeats, of which the median is taken.
-    """
-    prepare_precision("float64")
-    yield markdown_header(["what is computed", "device", "us a step of each"])
-    core = jax.devices("cpu")[0]
-    with jax.default_device(core):
-        backend, recordings = _record_circuits(steps)
-    for device in dict.fromkeys([jax.devices()[0], core]):
-        gpu = device.platform != "cpu"
-        name = device.device_kind if gpu else "one core"
-        with jax.default_device(device):
-            for n in BATCH_SIZES:
-                for engine in ("window", "dense"):
-                    replay, start = replay_network(n, engine, SINGLE, np.float32)
-                    us = _median(partial(replay, start), SINGLE, rounds)
-                    yield markdown_row([f"one network of {n} cells a side, {engine}", name, f"{us:.0f}"])
-            many = sets if gpu else max(sets // 5, 1)
-            for every in (0, EVERY, 1):
-                call = _set_call(many, every, many if gpu else batch.BLOCK)
-                us = _median(call, many * FEW, rounds)
-                views = f"a view every {every} steps" if every else "path integration"
-                yield markdown_row([f"{many} sets of 21 cells, {views}", name, f"{us:.2f}"])
-            several = sessions if gpu else len(recordings)
-            used = [recordings[k % len(recordings)] for k in range(several)]
-            run = SessionBatch(backend, at_once=gpu)
-            us = _median(partial(run.replay, used), several * steps, rounds)
-            states = run.replay(used)
-            gap = max(  # largest difference of a belief from that of the single run
-                float(np.abs(np.asarray(found[k], float) - own).max(initial=0.0))
-                for k, recording in enumerate(used)
-                for found, own in zip(states.belief, recording.state.belief, strict=True)
-            )
-            what = f"{several} sessions of {steps} steps, largest difference of a belief {gap:.0e}"
-            yield markdown_row([what, name, f"{us:.1f}"])
-    with jax.default_device(core):
-        run = SessionBatch(backend, at_once=False)
-        us = _median(lambda: [run.replay([each]) for each in recordings], len(recordings) * steps, rounds)
-    what = f"{len(recordings)} sessions of {steps} steps, each in a call"
-    yield markdown_row([what, "one core", f"{us:.1f}"])
-
-
-def _record_circuits(steps: int) -> tuple[RecallBackend, list[Recording]]:
-    """The backend and recordings of the first steps of `RECORDED` whisker sessions of ten circuits whose maps
-    need as many pose cells."""
-    recordings: list[Recording] = []
-    for seed in count():
-        config = load_config(SESSIONS["circuits"], [f"simulation.seed={seed}"])
-        with open_observations(config) as (config, source):
-            log = load_into_memory(source)
-        observations = [observation_of(sample) for sample in log][:steps]
-        made = build_session(config, log)
-        if not seed:
-            assert isinstance(made.backend, RecallBackend)
-            backend, session = made.backend, RecordingSession(made.backend, reserve=made.reserve)
-        found = session.record(observations)
-        sides = [sides for _, _, sides, _, _ in found.chunks]  # numbers of cells along x and y
-        if not recordings or sides == [sides for _, _, sides, _, _ in recordings[0].chunks]:
-            recordings.append(found)
-        if len(recordings) == RECORDED:
-            break
-    return backend, recordings
-
-
-def _set_call(sets: int, every: int, block: int) -> Callable[[], Any]:
-    """A call of `FEW` steps of many parameter sets, with a view half a torus away every so many steps, 0:
-    none."""
-    config, single = NetworkConfig(cells_xy=21), np.dtype(np.float32)
-    unit, ring = units(config, single), rings(config, single)
-    motion = np.tile(np.array([MOTION[0] * unit[0], 0.0, MOTION[1] * unit[2]], single), (FEW, 1))
-    seen = np.arange(FEW) % every == every - 1 if every else np.zeros(FEW, bool)
-    course = batch.Course(
-        motion, np.tile(np.asarray(ring, single) / 2, (FEW, 1)), np.where(seen, 0.02, 0.0).astype(single)
-    )
-    spread = np.linspace(0.9, 1.1, sets, dtype=single)
-    given = batch.Network(spread, 2 * spread, np.full(sets, 2e-5, single), spread)
-    return lambda: batch.networks(config, given, course, block)
-
-
-def _median(call: Callable[[], Any], steps: int, rounds: int) -> float:
-    """Median us of a step of a call that makes so many, which is compiled first."""
-    jax.block_until_ready(call())
-    return interleaved_medians({"": (call, steps)}, rounds)[""]

@@ -18,7 +18,7 @@ from scipy.special import expit, logit
 from evaluation.metrics.statistics import auc, expected_calibration_error
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.recordings import require_recordings
-from ratslam.recall.signed_likelihood import ImagePairs, learn, log_odds, project, stored_image
+from ratslam.recall.signed_likelihood import learn, log_odds, project, stored_image
 from robot.recordings.real_whiskers import read_contacts, read_object
 from tactile.base.random_streams import stream
 
@@ -93,7 +93,7 @@ def _hold_out(views: np.ndarray, thing: np.ndarray, run: np.ndarray, held: np.nd
     alike = others[a] == others[b]
     one = np.flatnonzero(alike & (run[a] != run[b]))[:PAIRS]
     two = np.flatnonzero(~alike)[: 5 * PAIRS]
-    pairs, apart = ImagePairs(stored[a[one]], stored[b[one]]), np.column_stack([a[two], b[two]])
+    pairs, apart = np.stack([stored[a[one]], stored[b[one]]]), np.column_stack([a[two], b[two]])
     model = learn(stored, pairs, apart)
     known = project(model, stored.T)
     found = project(model, stored_image(seen, alive).T)

@@ -41,10 +41,11 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
         config = _fill(config, {"templates": {"source": "labels"}})
     if info.signed_views:
         config = _fill(config, {"recall": {"images": "signed"}})
-    if _is_other_touch(config, source):
-        # Touch without whiskers around the robot: what it measures has no layout that is known here.
+    # Touch without whiskers around the robot: what it measures has no layout that is known here.
+    other_touch = config.touch.frontend is not None and not source.whiskers
+    if other_touch:
         config = _fill(config, {"recall": {"sector_fov": "none"}})
-    names = _choose_presets(config, source) if config.presets is None else config.presets
+    names = _choose_presets(config, source, other_touch) if config.presets is None else config.presets
     for name in names:
         config = _fill(config, PRESETS[name])
     config = config.model_copy(update={"presets": names})
@@ -57,20 +58,15 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
     return _fill(config, {"grid": {"side": round(2 * (EXTENT_FACTOR * extent_m + EXTENT_MARGIN), 2)}})
 
 
-def _choose_presets(config: RunConfig, source: Source) -> tuple[PresetName, ...]:
+def _choose_presets(config: RunConfig, source: Source, other_touch: bool) -> tuple[PresetName, ...]:
     """The presets of a configuration that names none."""
     if config.backend == "grid":
         return ("arm",) if source.info.planar_whiskers is None else ("create",)
-    if _is_other_touch(config, source):
+    if other_touch:
         return ("touch",)
     recall = config.recall
     fov = recall.sector_fov if "sector_fov" in recall.model_fields_set else "whiskers"
     return ("touch",) if source.whiskers and fov == "whiskers" else ()
-
-
-def _is_other_touch(config: RunConfig, source: Source) -> bool:
-    """Whether the views are those of a registered touch sensor without whiskers."""
-    return config.touch.frontend is not None and not source.whiskers
 
 
 def _fill(settings: Any, values: dict[str, Any]) -> Any:

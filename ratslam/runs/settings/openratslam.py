@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.settings.strict_yaml import validate
+from ratslam.runs.settings.strict_yaml import open_path, validate
 from ratslam.runs.settings.yaml_document import Document, KeyPath, Place
 from robot.recordings.video import SUFFIXES as VIDEO_SUFFIXES
 from robot.sources.input_files import raise_errors, read_bytes
@@ -107,15 +107,12 @@ def convert_parameters(path: Path, recording: Path | None = None) -> tuple[dict[
             value /= _rate(values)  # there a speed, here a distance between frames
         section = "ratslam" if key in RATSLAM else "visual_odometry"
         for setting in paths:
-            keys = tuple(setting.split("."))
             if value is not None:
-                part = settings
-                for name in keys[:-1]:
-                    part = part.setdefault(name, {})
+                part, keys = open_path(settings, setting, key)
                 part[keys[-1]] = value
             if key in values:
                 at = f"{path}:{lines[section, key]}: {key}:"
-                places[keys] = Place(at, at)
+                places[tuple(setting.split("."))] = Place(at, at)
     notes += _put_source(settings, file, root, values)
     notes += _notes(values, settings)
     validate(Document(settings, places), RunConfig)

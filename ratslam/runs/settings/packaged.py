@@ -70,10 +70,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
     # stays lost, because all that recall finds then is weak.
     "touch": {
         "pose_cells": {"cell_size": 0.05, "cells_xy": 21},
-        "recall": {
-            "sector_fov": "whiskers",
-            "enter": 0.2,
-        },
+        "recall": {"sector_fov": "whiskers", "enter": 0.2},
         "keyframes": {
             "noise": {"per_cell": 0.22, "heading_per_cell": 0.063, "heading_per_radian": 0.126},
             "bias_sd": 0.001,
@@ -106,9 +103,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
     # (robot/recordings/README.md). Patch normalisation is that of RatSLAM (Ball et al. 2013).
     "visual_odometry": {
         "templates": {"patch": 2},
-        "keyframes": {
-            "noise": {"per_cell": 0.15, "heading_per_cell": 0.03, "heading_per_radian": 0.1},
-        },
+        "keyframes": {"noise": {"per_cell": 0.15, "heading_per_cell": 0.03, "heading_per_radian": 0.1}},
     },
     # Fox et al. 2012, II and III: the defaults of `grid` are those of their Create.
     "create": {},

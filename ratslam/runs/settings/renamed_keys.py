@@ -31,7 +31,9 @@ def with_moved_settings(document: Document) -> Document:
     wrote, which has all of them; a user's own are unknown keys.
     """
     data, places = copy.deepcopy(document.data), dict(document.places)
-    paths = {_path(old): None if new is None else _path(new) for old, new in MOVED.items()}
+    paths: dict[KeyPath, KeyPath | None] = {
+        tuple(old.split(".")): None if new is None else tuple(new.split(".")) for old, new in MOVED.items()
+    }
     written = all(old in places for old, new in paths.items() if new is None)
     for old, new in paths.items():
         if old not in places or (new is None and not written):
@@ -45,7 +47,3 @@ def with_moved_settings(document: Document) -> Document:
             places.setdefault(new[:1], place)
             places.setdefault(new, place)
     return Document(data, places)
-
-
-def _path(name: str) -> KeyPath:
-    return tuple(name.split("."))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, NonNegativeInt, ValidationInfo, field_validator
+from pydantic import BaseModel, Field, NonNegativeInt, ValidationError, ValidationInfo, field_validator
 
 from evaluation.metrics.exm import ExmConfig
 from evaluation.metrics.metric_registry import METRICS
@@ -224,3 +224,43 @@ def _resolved_plugin(config: PluginConfig, registry: Registry[Any], folder: Path
     paths = {name: folder / value for name, value in settings if isinstance(value, Path)}
     given: dict[str, Any] = json.loads(settings.model_copy(update=paths).model_dump_json(exclude_unset=True))
     return config.model_copy(update={"settings": given})
+
+
+def changed_settings(path: Path) -> list[tuple[str, str, str]]:
+    """The settings in a configuration file that differ from the defaults, in the order of the file: of each
+    its dotted path, and its value and default as JSON ('' for a setting without default).
+
+    Of a path only the name is given. The file of a run directory is completed: values of its source and of
+    presets are among them.
+
+    Raises:
+        InputErrors: the configuration has errors.
+    """
+    document = with_moved_settings(load(path))
+    return list(_changes(validate(document, LoopConfig), LoopConfig(), ""))
+
+
+def _changes(section: BaseModel, default: BaseModel | None, prefix: str) -> Iterator[tuple[str, str, str]]:
+    """The changes in a section; a default of None: it has none, because some setting must be given."""
+    values = section.model_dump(mode="json")
+    for name, field in type(section).model_fields.items():
+        value = getattr(section, name)
+        usual = field.get_default(call_default_factory=True) if default is None else getattr(default, name)
+        if isinstance(value, BaseModel):
+            if not isinstance(usual, type(value)):
+                try:
+                    usual = type(value)()
+                except ValidationError:
+                    usual = None
+            yield from _changes(value, usual, f"{prefix}{name}.")
+        elif field.is_required() or value != usual:
+            shown = value.name if isinstance(value, Path) else values[name]  # its folder is private
+            yield prefix + name, _text(shown), "" if field.is_required() else _text(usual)
+
+
+def _text(value: Any) -> str:
+    return json.dumps(
+        value,
+        default=lambda part: part.model_dump(mode="json") if isinstance(part, BaseModel) else str(part),
+        ensure_ascii=False,
+    )

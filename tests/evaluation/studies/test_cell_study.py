@@ -24,8 +24,8 @@ from evaluation.studies.cell_study import (
     score_sets,
 )
 from evaluation.studies.executor import Executor
+from evaluation.studies.network_batch import CellSets, walk
 from evaluation.studies.study_course import expected_poses, place_bins, read_course
-from ratslam.classic.batch import CellSets, Network, walk
 from ratslam.cli import main
 from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.settings.run_config import load_config
@@ -79,7 +79,7 @@ def sets_of(arguments: list[str]) -> list[str]:
 def test_without_noise_the_packet_follows_the_truth(box):
     study = cell_study(box(), ["steps=200", "sets=1", "precision=float64"])
     one = [np.array([value]) for value in (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0)]
-    scores = score_sets(study.course, CellSets(Network(*one[:4]), *one[4:]), np.dtype(float))
+    scores = score_sets(study.course, CellSets(*one), np.dtype(float))
     assert scores.drift[0] < 0.02  # a fifth of a cell
     assert scores.drift_heading[0] < 0.05
     assert scores.decoding[0] <= scores.drift[0]
@@ -123,7 +123,7 @@ def test_views_give_the_packets_of_the_classic_backend():
     config = load_config("square", ["session.precision=float64"])
     course = read_course(config, 240, True, 5, (), 0)
     one = [np.array([value]) for value in (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0)]
-    sets = CellSets(Network(*one[:4]), *one[4:])
+    sets = CellSets(*one)
     tracks = list(walk(course.config, sets, course.course, course.chosen))
     packets = np.concatenate([track.pose[0] for track in tracks])
     with open_observations(config.model_copy(update={"backend": "classic"})) as (whole, source):

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit, logit
 
+from evaluation.papers.trial_sessions import distinct_cells
 from ratslam.grid import likelihoods
 from ratslam.grid.config import LikelihoodConfig
 from tests.helpers.grid_world import LENGTH
@@ -17,18 +18,19 @@ from tests.helpers.grid_world import LENGTH
 CONFIG = LikelihoodConfig()
 PRIOR = 0.3
 SEGMENTS = 5
-MODELS = {"literal": likelihoods.all_cells, "distinct": likelihoods.distinct_cells}
+MODELS = {"literal": lambda cell, hits: np.ones(cell.shape[:-1], bool), "distinct": distinct_cells}
 EVIDENCE = st.floats(-30, 30)
 
 free = jax.jit(likelihoods.free_space, static_argnums=0)
 contact = jax.jit(likelihoods.contact, static_argnums=0)
 direction = jax.jit(likelihoods.wall_direction, static_argnums=0)
-weighing = jax.jit(likelihoods.printed_likelihood, static_argnums=(0, 5))
+weighing = jax.jit(likelihoods.printed_likelihood, static_argnums=0)
 
 
 def printed(counted, evidence, cell, hits, alive=None):
     """[N] log-likelihoods; all whiskers report unless `alive` is given."""
-    return weighing(PRIOR, evidence, cell, hits, np.ones_like(hits) if alive is None else alive, counted)
+    alive = np.ones_like(hits) if alive is None else alive
+    return weighing(PRIOR, evidence, hits, counted(cell, hits) & alive[None, :, None])
 
 
 def by_loops(model, evidence, cell, hits, alive):

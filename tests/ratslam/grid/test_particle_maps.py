@@ -10,25 +10,23 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
 from ratslam.grid import particles
-from ratslam.grid.particles import LAYERS, Windows
+from ratslam.grid.particles import LAYERS
 
 COUNT, SIDE = 3, 24
 
 WINDOW = 16
 read = jax.jit(particles.interpolate, static_argnums=1)
 around = jax.jit(
-    lambda place, side, size=WINDOW: particles.windows_around(place, side, size).corner,
+    lambda place, side, size=WINDOW: particles.windows_around(place, side, size),
     static_argnums=(1, 2),
 )
 cut = jax.jit(
-    lambda maps, corner, size, layer: particles.read_window(maps, Windows(corner, size), layer),
+    particles.read_window,
     static_argnums=(2, 3),
 )
 put = jax.jit(
-    lambda maps, corner, size, layer, values: particles.write_window(
-        maps, Windows(corner, size), layer, values
-    ),
-    static_argnums=(2, 3),
+    particles.write_window,
+    static_argnums=2,
 )
 
 
@@ -86,17 +84,16 @@ def test_windows_lie_inside_the_map_and_contain_their_place(side, size, dtype):
         stream.uniform(0, side - 1, (50, 2)),
         stream.normal(0, 10.0 ** stream.uniform(0, 12, (50, 1)), (50, 2)),
     )
-    windows = particles.windows_around(np.concatenate([near, far]).astype(dtype), side, size)
-    assert windows.size == min(size, side)
-    assert windows.corner.dtype == np.int32
-    corner = np.asarray(windows.corner)
+    size = min(size, side)
+    corner = np.asarray(particles.windows_around(np.concatenate([near, far]).astype(dtype), side, size))
+    assert corner.dtype == np.int32
     assert (corner >= 0).all()
-    assert (corner + windows.size <= side).all()
+    assert (corner + size <= side).all()
     # The place is in the middle, except at the rim of the map.
-    left, right = near - corner[:50], corner[:50] + windows.size - 1 - near
-    room = windows.size // 2 - 1
+    left, right = near - corner[:50], corner[:50] + size - 1 - near
+    room = size // 2 - 1
     assert ((left >= room) | (corner[:50] == 0)).all()
-    assert ((right >= room) | (corner[:50] + windows.size == side)).all()
+    assert ((right >= room) | (corner[:50] + size == side)).all()
 
 
 @pytest.mark.parametrize("size", [6, WINDOW, SIDE])
@@ -107,9 +104,9 @@ def test_written_windows_are_read_back_and_nothing_else_changes(size, layer):
     before = cut(maps, corner, size, layer)
     for k, (x, y) in enumerate(corner):
         assert np.array_equal(before[k], maps[k, layer, y : y + size, x : x + size])
-    assert np.array_equal(put(maps, corner, size, layer, before), maps)
+    assert np.array_equal(put(maps, corner, layer, before), maps)
     values = np.random.default_rng(3).normal(size=before.shape)
-    after = np.array(put(maps, corner, size, layer, values))
+    after = np.array(put(maps, corner, layer, values))
     assert np.array_equal(cut(after, corner, size, layer), values)
     for k, (x, y) in enumerate(corner):
         after[k, layer, y : y + size, x : x + size] = before[k]
@@ -120,16 +117,8 @@ def test_places_in_windows_are_places_in_the_map():
     maps = filled()
     place = np.random.default_rng(4).uniform(4, SIDE - 5, (COUNT, 2))
     corner = np.asarray(around(place, SIDE))
-    inside = np.asarray(particles.to_window(place[:, None], Windows(corner, WINDOW)))
+    inside = np.asarray(particles.to_window(place[:, None], corner))
     assert inside[:, 0] == pytest.approx(place - corner)
     windows = np.stack([cut(maps, corner, WINDOW, layer) for layer in range(LAYERS)], axis=1)
     for layer in range(LAYERS):
         assert read(windows, layer, inside) == pytest.approx(np.asarray(read(maps, layer, place[:, None])))
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_an_empty_map_has_no_evidence(dtype):
-    maps = particles.empty_maps(COUNT, SIDE, dtype)
-    assert maps.shape == (COUNT, LAYERS, SIDE, SIDE)
-    assert maps.dtype == dtype
-    assert not np.any(maps)

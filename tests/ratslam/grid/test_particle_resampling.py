@@ -133,9 +133,3 @@ def test_copies_differ_a_little_and_survivors_not_at_all():
     jitter = np.concatenate([after.pose - before.pose[7], after.session - before.session[7]], axis=1)
     jitter = np.delete(jitter, 7, axis=0) / [0.01, 0.01, 0.02, 0.03, 0.03]
     assert np.abs(np.cov(jitter.T) - np.eye(5)).max() < 4.5 * np.sqrt(2 / count)
-
-
-def test_identity_makes_no_copies():
-    resampling = particles.identity(COUNT)
-    assert resampling.copies == 0
-    assert np.array_equal(resampling.ancestor, np.arange(COUNT))

@@ -56,11 +56,9 @@ def corridor(backend, reports, spread):
     config, fine = backend.config, 2e-3
     x = np.arange(-0.3, 1.2, fine)
     pose = np.stack([x, 0 * x, 0 * x], axis=1)
-    maps = (
-        particles.empty_maps(1, backend.side, np.dtype(float))
-        .at[0, EVIDENCE]
-        .set(column_of_wall(backend, 0.65))
-    )
+    maps = np.zeros((1, particles.LAYERS, backend.side, backend.side))
+    maps[0, EVIDENCE] = column_of_wall(backend, 0.65)
+    maps = jnp.asarray(maps)
     belief, touched, moments = np.where(np.abs(x) < fine / 2, 1.0, 0.0), np.zeros(2, bool), []
 
     def evidence(points):

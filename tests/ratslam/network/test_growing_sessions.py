@@ -12,7 +12,6 @@ import pytest
 
 from ratslam.core.session import CHUNK, Probe
 from ratslam.network.pose_cells import Belief
-from ratslam.recall.memory import accumulate_motion
 from tests.ratslam.network import alike_places
 from tests.ratslam.network.alike_places import PLACES
 
@@ -160,7 +159,7 @@ def test_the_preferred_poses_of_cells_turn_with_the_robot(layers):
     state = backend.init(None, 256)._replace(belief=belief)
     memory = state.memory._replace(turn_error=jnp.asarray(0.25))
     turn = jnp.asarray([0.0, 0.0, 0.8 * layers * np.pi / 18])
-    state = state._replace(memory=accumulate_motion(memory, turn))
+    state = state._replace(memory=memory.accumulate_motion(turn))
     expected = np.roll(belief.activity, layers, axis=0).ravel()
     found = jax.jit(backend.probe().each)(state, recorded_cells())
     assert np.asarray(found) == pytest.approx(expected[recorded_cells()], abs=1e-4)

@@ -82,8 +82,8 @@ def test_where_cells_lie_in_memory_does_not_matter(monkeypatch):
     tie, excite = pose_cells.tie, pose_cells.excite
 
     def tie_elsewhere(network, shape, cells):
-        ties = tie(network, shape, cells)
-        return ties._replace(index=jnp.asarray(shuffled(int(np.prod(shape))))[ties.index])
+        index, weight = tie(network, shape, cells)
+        return jnp.asarray(shuffled(int(np.prod(shape))))[index], weight
 
     def excite_neighbours(network, activity):
         order = shuffled(activity.size)

@@ -64,8 +64,8 @@ def test_what_view_cells_drive_and_what_they_read_are_adjoint(seed):
 @given(seeds)
 def test_shares_are_those_of_the_eight_cells_around(seed):
     case = random_case(seed)
-    ties = tie(case.network, case.shape, cells_at(case.poses, case.used))
-    index, weight = np.asarray(ties.index), np.asarray(ties.weight, float)
+    index, weight = tie(case.network, case.shape, cells_at(case.poses, case.used))
+    index, weight = np.asarray(index), np.asarray(weight, float)
     assert index.min() >= 0
     assert index.max() < np.prod(case.shape)
     assert weight.min() >= 0

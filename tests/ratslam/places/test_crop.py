@@ -12,7 +12,6 @@ from ratslam.methods.config import RecallBackendConfig
 from ratslam.methods.recall import RecallBackend, RecallState
 from ratslam.places.crop import crop_map, keyframes_in_box, keyframes_of_piece, keyframes_of_steps
 from ratslam.places.difference import difference, keyframe_content
-from ratslam.recall.memory import crop_rows
 from tactile.base.se2 import compose
 from tests.ratslam.mapping.map_cases import CELL, LAP, STEP, drive, new_map
 from tests.ratslam.mapping.merging_cases import Drive, circles
@@ -131,7 +130,7 @@ def test_an_empty_part_is_refused(made) -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_the_memory_keeps_the_rows_that_remain(seed: int) -> None:
     memory, rows, inside = cropped_memory(seed)
-    after, count = crop_rows(memory, rows), int(inside.sum())
+    after, count = memory.crop_rows(rows), int(inside.sum())
     kept = np.flatnonzero(inside)
     assert int(after.count) == count
     assert int(after.distinct) == count, "each keyframe has a label of its own"

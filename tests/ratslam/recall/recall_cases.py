@@ -13,12 +13,7 @@ from ratslam.network.pose_cells import Belief, anchor
 from ratslam.recall import observation_model
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.filter import recognise, view_cells
-from ratslam.recall.memory import (
-    MapFeedback,
-    accumulate_motion,
-    apply_map_feedback,
-    init_memory,
-)
+from ratslam.recall.memory import MapFeedback, init_memory
 
 CELL = 0.1
 SIZE = 12
@@ -65,7 +60,7 @@ def filled(
         count=jnp.int32(count),
         distinct=jnp.int32(len(set(ids[ids >= 0].tolist()))),
     )
-    return apply_map_feedback(memory, MapFeedback(poses, bias, turn_error, since, angle, scale))
+    return memory.apply_map_feedback(MapFeedback(poses, bias, turn_error, since, angle, scale))
 
 
 def holding(config, memory, masses=None, cell=CELL, shape=ROW):
@@ -147,8 +142,8 @@ def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
     shifts = stream.integers(0, len(mass), 4) if angle else np.full(4, len(mass) // 2)
     np.add.at(mass, (shifts, frames), stream.dirichlet(np.full(5, 0.7))[:-1])
     belief = believing(config, memory, mass, shape=SMALL)
-    memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
-    memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
+    memory = memory.accumulate_motion(jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
+    memory = memory.accumulate_motion(jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
     heaviest = frames[int(mass[shifts, frames].argmax())]
     near = np.roll(views[heaviest], int(stream.choice([-2, -1, 0, 0, 0, 1, 2])))
     return memory, belief, np.clip(0.6 * near + 0.4 * stream.random(SIZE), 0, 1)

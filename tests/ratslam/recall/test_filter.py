@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.recall.filter import place_of
-from ratslam.recall.memory import MapFeedback, accumulate_motion, apply_map_feedback
+from ratslam.recall.memory import MapFeedback
 from tactile.base.se2 import compose
 from tests.ratslam.recall.recall_cases import (
     ANGLE,
@@ -77,7 +77,7 @@ def test_single_precision_has_no_nan(stored, scale):
     belief = holding(FAN, memory, {3: 0.7, 20: 0.3})
     for value in (0.0, 0.5, 1.0, None, 1.0, 0.0):
         seen = stream.random(SIZE) if value is None else np.full(SIZE, value)
-        memory = accumulate_motion(memory, jnp.asarray([0.5 * CELL, 0, 0.01], jnp.float32))
+        memory = memory.accumulate_motion(jnp.asarray([0.5 * CELL, 0, 0.01], jnp.float32))
         belief, found = observe(FAN, memory, seen, belief)
         result = found._replace(background=np.zeros(0))  # there NaN says none
         assert not any(np.isnan(leaf).any() for leaf in jax.tree.leaves((belief, result)))
@@ -143,7 +143,7 @@ def test_the_frame_of_the_map_does_not_matter():
         poses = compose(elsewhere, frames[: int(memory.count)])
         names = ("bias", "turn_error", "since", "angle", "scale")
         result = MapFeedback(poses, *(float(getattr(memory, name)) for name in names))
-        moved = apply_map_feedback(memory, result)
+        moved = memory.apply_map_feedback(result)
         moved = moved._replace(pose=jnp.asarray(compose(elsewhere, memory.pose)))
         held = believing(FAN, moved, belief.mass, shape=SMALL)
         found, there = observe(FAN, memory, view, belief)[1], observe(FAN, moved, view, held)[1]
@@ -198,7 +198,7 @@ def test_the_packet_of_a_turned_robot_moves_along_its_own_heading():
     views[13] = views[12]  # both views are equal
     memory = filled(FAN, views, poses, angle=ANGLE, scale=0.02)
     belief, _ = observe(FAN, memory, seen(11, robot))
-    memory = accumulate_motion(memory, jnp.asarray([3 * CELL, 0, 0.0]))
+    memory = memory.accumulate_motion(jnp.asarray([3 * CELL, 0, 0.0]))
     _, found = observe(FAN, memory, views[12], belief)
     assert found.match == 12
     assert found.shift == 0

@@ -11,7 +11,6 @@ from ratslam.core.session import Session
 from ratslam.methods.config import RecallBackendConfig
 from ratslam.methods.recall import RecallBackend
 from ratslam.recall.filter import place_of, recognise
-from ratslam.recall.memory import accumulate_motion
 from ratslam.recall.observation_model import LABEL_TEMPER, LABELS, SAMPLES, ObservationLikelihood, label_gains
 from tactile.base.se2 import compose
 from tactile.base.types import Odometry, observation
@@ -50,7 +49,7 @@ def test_without_a_scale_nothing_is_recalled_but_all_is_remembered():
     assert found.keyframe == 40
     assert observe(FAN, memory._replace(scale=jnp.asarray(0.1)), views[7])[1].match == 7
 
-    memory = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.5]))
+    memory = memory.accumulate_motion(jnp.asarray([CELL, 0.0, 0.5]))
     memory = memory.store_keyframe(jnp.asarray(views[7]), jnp.int32(5))
     assert int(memory.count) == 41
     assert np.array_equal(memory.view[:, 40], views[7])
@@ -146,7 +145,7 @@ def test_odometry_alone_is_never_evidence():
             belief, limit = holding(FLAT, memory, {0: sure}), sure
             for _ in range(20):
                 limit = limit * (1 - FLAT.leak) + (1 - limit) * FLAT.enter
-                robot = accumulate_motion(robot, jnp.asarray([0.5 * CELL, 0.0, 0.0]))
+                robot = robot.accumulate_motion(jnp.asarray([0.5 * CELL, 0.0, 0.0]))
                 belief, _ = observe(FLAT, robot, same, belief) if seeing else look(robot, belief)
                 robot = robot._replace(pose=robot.current_pose(), motion=jnp.zeros(3), length=jnp.zeros(()))
                 assert float(belief.activity.sum()) <= limit + 1e-5
@@ -169,8 +168,8 @@ def test_a_packet_that_reaches_no_frame_becomes_novelty():
     memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40, 1.0), scale=0.1)
     belief = holding(FLAT, memory, {9: 1.0})
     view = np.full(SIZE, FLAT.floor * 0.1)
-    on_way = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.0]))
-    aside = accumulate_motion(memory, jnp.asarray([0.0, 4 * CELL, 0.0]))
+    on_way = memory.accumulate_motion(jnp.asarray([CELL, 0.0, 0.0]))
+    aside = memory.accumulate_motion(jnp.asarray([0.0, 4 * CELL, 0.0]))
     assert observe(FLAT, on_way, view, belief)[1].novelty < 0.05
     assert observe(FLAT, aside, view, belief)[1].novelty == pytest.approx(1, abs=1e-6)
 
@@ -183,7 +182,7 @@ def test_a_path_driven_out_and_back_is_followed_in_the_heading_of_the_robot():
     memory = filled(FLAT, views, poses)
     for begin, step in ((10, 2), (21, -2)):
         belief, robot = holding(FLAT, memory, {begin: 0.5}), memory
-        robot = accumulate_motion(robot, jnp.asarray([2 * CELL, 0.0, 0.0]))
+        robot = robot.accumulate_motion(jnp.asarray([2 * CELL, 0.0, 0.0]))
         after, found = observe(FLAT, robot, views[begin + step], belief)
         assert found.match == begin + step
         assert after.mass[0, begin + step] > 0.9

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ratslam.recall.config import RecallConfig
-from ratslam.recall.memory import MergedRows, init_memory, merge_rows
+from ratslam.recall.memory import MergedRows, init_memory
 
 TOUCH = RecallConfig(sector_fov="whiskers")
 FAN = RecallConfig(sector_fov="auto")
@@ -44,7 +44,7 @@ def random_merge(stream):
 def test_rows_are_those_that_remain(seed, config):
     stream = np.random.default_rng(seed)
     memory, merged = random_memory(stream, config), random_merge(stream)
-    after, rows = merge_rows(memory, merged), len(merged.source)
+    after, rows = memory.merge_rows(merged), len(merged.source)
     assert int(after.count) == rows
     assert np.array_equal(np.asarray(after.view)[:, :rows], merged.view.T)
     assert np.array_equal(np.asarray(after.label)[:rows], merged.label)
@@ -67,7 +67,7 @@ def test_rows_are_those_that_remain(seed, config):
 def test_shapes_and_dtypes_stay(dtype):
     stream = np.random.default_rng(0)
     memory, merged = random_memory(stream, TOUCH, dtype), random_merge(stream)
-    after = merge_rows(memory, merged)
+    after = memory.merge_rows(merged)
     assert jax.tree.map(np.shape, after) == jax.tree.map(np.shape, memory)
     assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, memory)
     leaves = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(after) if isinstance(leaf, jax.Array)]
@@ -80,7 +80,7 @@ def test_merged_keyframes_can_be_restored():
     memory, count = random_memory(stream, TOUCH, count=10), 10
     source = np.repeat(np.arange(count), 2)
     views = stream.integers(1, 5, (2 * count, SIZE)), np.arange(2 * count)
-    after = merge_rows(memory, MergedRows(source, *views, 2 * np.arange(count), np.zeros((count, 3))))
+    after = memory.merge_rows(MergedRows(source, *views, 2 * np.arange(count), np.zeros((count, 3))))
     assert int(after.count) == 2 * count
     for begin in (0, 1):
         assert np.array_equal(np.asarray(after.x)[begin : 2 * count : 2], memory.x[:count])
@@ -94,6 +94,6 @@ def test_more_rows_than_the_memory_holds_are_refused():
         views = np.ones((count, SIZE), int), np.zeros(count, int)
         return MergedRows(source, *views, np.arange(COUNT), np.zeros((COUNT, 3)))
 
-    assert int(merge_rows(memory, rows(CAPACITY)).count) == CAPACITY
+    assert int(memory.merge_rows(rows(CAPACITY)).count) == CAPACITY
     with pytest.raises(ValueError, match=f"{CAPACITY + 1} keyframes do not fit into a memory of {CAPACITY}"):
-        merge_rows(memory, rows(CAPACITY + 1))
+        memory.merge_rows(rows(CAPACITY + 1))

@@ -13,12 +13,7 @@ from hypothesis import strategies as st
 
 from ratslam.recall.config import RecallConfig
 from ratslam.recall.filter import place_of
-from ratslam.recall.memory import (
-    MapFeedback,
-    accumulate_motion,
-    apply_map_feedback,
-    init_memory,
-)
+from ratslam.recall.memory import MapFeedback, init_memory
 from ratslam.recall.observation_model import STEPS
 from ratslam.recall.whisker_likelihood import DEAD, HEIGHTS, LEVELS, pixel_levels
 from tests.ratslam.recall.recall_cases import believing
@@ -77,13 +72,13 @@ def test_mass_is_conserved_along_a_path(config, dtype):
     turn = 2 * np.pi / 20
     likeness = learn(images_of(stream, 200))
     memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
-    memory = apply_map_feedback(
-        memory, MapFeedback(np.zeros((1, 3)), 0.0, 0.0, 0.0, np.pi, NEW_IMAGE_LOG_ODDS, likeness)
+    memory = memory.apply_map_feedback(
+        MapFeedback(np.zeros((1, 3)), 0.0, 0.0, 0.0, np.pi, NEW_IMAGE_LOG_ODDS, likeness)
     )
     again, belief = [], None
     for k in range(60):
         level = np.where(stream.random(SIZE) < 0.9, lap[k % 20], images_of(stream, 1)[0])
-        memory = accumulate_motion(memory, jnp.asarray([0.6 * CELL, 0.0, turn], memory.x.dtype))
+        memory = memory.accumulate_motion(jnp.asarray([0.6 * CELL, 0.0, turn], memory.x.dtype))
         memory, belief, found = observe(config, memory, level, belief)
         assert not any(np.isnan(leaf).any() for leaf in jax.tree.leaves((memory, belief, found[:-1])))
         assert {leaf.dtype for leaf in jax.tree.leaves((memory, found))} == {
@@ -206,7 +201,7 @@ def test_a_packet_follows_the_frames_in_the_direction_of_the_head(turned):
     mass = np.zeros((2, CAPACITY))
     mass[int(turned), 20] = 0.5
     belief = believing(BOTH, memory, mass, CELL)
-    memory = accumulate_motion(memory, jnp.asarray([CELL, 0.0, 0.0]))
+    memory = memory.accumulate_motion(jnp.asarray([CELL, 0.0, 0.0]))
     _, after, _ = observe(BOTH, memory, images[0], belief)
     assert np.unravel_index(after.mass.argmax(), after.mass.shape) == (int(turned), 19 if turned else 21)
 

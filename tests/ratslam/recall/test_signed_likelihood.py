@@ -12,12 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ratslam.recall.config import RecallConfig
-from ratslam.recall.memory import MapFeedback, apply_map_feedback, init_memory
+from ratslam.recall.memory import MapFeedback, init_memory
 from ratslam.recall.observation_model import signed_likelihood
 from ratslam.recall.signed_likelihood import (
     DIRECTIONS,
     PRIOR,
-    ImagePairs,
     calibrate,
     calibrated,
     learn,
@@ -47,7 +46,7 @@ PLACE = np.repeat(np.arange(PLACES), VISITS)
 
 def pairs_of(images, places=PLACE):
     one, other = np.nonzero(np.triu(places[:, None] == places, 1))
-    return ImagePairs(images[one], images[other])
+    return np.stack([images[one], images[other]])
 
 
 def apart_of(places=PLACE):
@@ -119,7 +118,7 @@ def test_noise_that_pixels_share_is_removed():
 
 def test_without_confirmed_pairs_successive_images_teach():
     images = images_of(2)
-    none = ImagePairs(images[:0], images[:0])
+    none = np.zeros((2, 0, images.shape[1]))
     odds = all_odds(learn(images, none, apart_of()), images)
     np.fill_diagonal(odds, -np.inf)
     assert (PLACE[odds.argmax(axis=1)] == PLACE).mean() > 0.9
@@ -127,7 +126,7 @@ def test_without_confirmed_pairs_successive_images_teach():
 
 def test_images_without_places_give_little_evidence():
     images = np.random.default_rng(4).normal(size=(120, SIZE))
-    odds = all_odds(learn(images, ImagePairs(images[:0], images[:0]), apart_of()), images)
+    odds = all_odds(learn(images, np.zeros((2, 0, SIZE)), apart_of()), images)
     np.fill_diagonal(odds, 0.0)
     assert np.quantile(odds, 0.99) < 1
 
@@ -149,7 +148,7 @@ def test_calibration_without_pairs_is_the_prior():
 
 def test_constant_and_few_pixels():
     for images in (np.zeros((50, 3)), images_of(0, size=3)[:50]):
-        model = learn(images, ImagePairs(images[:4], images[4:8]), apart_of()[:20] % 50)
+        model = learn(images, np.stack([images[:4], images[4:8]]), apart_of()[:20] % 50)
         assert model.projection.shape == (3, DIRECTIONS)
         assert np.isfinite(all_odds(model, images)).all()
 
@@ -163,7 +162,7 @@ def test_kernel_gives_the_same_log_odds(dtype):
     view[:, : len(images)] = images.T
     memory = memory._replace(view=jnp.asarray(view), count=jnp.int32(len(images)))
     poses = np.zeros((len(images), 3))
-    memory = apply_map_feedback(memory, MapFeedback(poses, 0.0, 0.0, 0.0, 0.0, 3.0, pack(model)))
+    memory = memory.apply_map_feedback(MapFeedback(poses, 0.0, 0.0, 0.0, 0.0, 3.0, pack(model)))
     weigh = jax.jit(lambda memory, image: signed_likelihood(config, memory, image))
     _, found = weigh(memory, jnp.asarray(images[7], dtype))
     likelihood = np.exp(all_odds(unpack(pack(model)), images)[7])

@@ -13,7 +13,6 @@ from ratslam.recall.whisker_likelihood import (
     HEIGHTS,
     LEVELS,
     PRIOR,
-    Background,
     Variation,
     estimate_background,
     estimate_variation,
@@ -40,15 +39,13 @@ def images(seed, count=60, size=SIZE, touching=0.4, dead=0.1):
 def common(seed, groups=3):
     """A possible background with rare and common heights."""
     stream = np.random.default_rng(seed)
-    return Background(
-        stream.uniform(0.02, 0.98, groups), stream.dirichlet(np.full(HEIGHTS, 0.5), groups) + 1e-9
-    )
+    return stream.uniform(0.02, 0.98, groups), stream.dirichlet(np.full(HEIGHTS, 0.5), groups) + 1e-9
 
 
 def of_background(known, group):
     """[DEAD] probability of each level over all places."""
-    touching = known.touching[group]
-    heights = known.heights[group] / known.heights[group].sum()
+    touching, heights = (each[group] for each in known)
+    heights = heights / heights.sum()
     return np.concatenate([[1 - touching], touching * heights])
 
 
@@ -137,17 +134,18 @@ def test_levels_are_the_same_on_the_host_and_in_the_kernel(seed):
 
 
 def test_without_images_all_heights_are_alike():
-    known = estimate_background(np.zeros((0, SIZE), int), pixel_layout((3, 6, 1)).group)
-    assert np.allclose(known.heights, 1 / HEIGHTS)
-    assert ((known.touching > 0) & (known.touching < 1)).all()
+    touching, heights = estimate_background(np.zeros((0, SIZE), int), pixel_layout((3, 6, 1)).group)
+    assert np.allclose(heights, 1 / HEIGHTS)
+    assert ((touching > 0) & (touching < 1)).all()
 
 
 @given(seeds, st.floats(0, 1), st.floats(0, 1))
 def test_the_background_is_a_distribution(seed, touching, dead):
-    known = estimate_background(images(seed, 20, touching=touching, dead=dead), pixel_layout((3, 6, 1)).group)
-    assert ((known.touching > 0) & (known.touching < 1)).all()
-    assert (known.heights > 0).all()
-    assert np.allclose(known.heights.sum(axis=1), 1)
+    level = images(seed, 20, touching=touching, dead=dead)
+    found, heights = estimate_background(level, pixel_layout((3, 6, 1)).group)
+    assert ((found > 0) & (found < 1)).all()
+    assert (heights > 0).all()
+    assert np.allclose(heights.sum(axis=1), 1)
 
 
 def test_the_background_is_counted_by_ring_and_channel():
@@ -157,9 +155,9 @@ def test_the_background_is_counted_by_ring_and_channel():
     level = stream.choice([3, 20], (4000, SIZE), p=[0.25, 0.75]) * (
         stream.random((4000, SIZE)) < rates[group]
     )
-    known = estimate_background(level, group)
-    assert np.allclose(known.touching, rates, atol=0.01)
-    assert np.allclose(known.heights[:, [2, 19]], [0.25, 0.75], atol=0.02)
+    touching, heights = estimate_background(level, group)
+    assert np.allclose(touching, rates, atol=0.01)
+    assert np.allclose(heights[:, [2, 19]], [0.25, 0.75], atol=0.02)
 
 
 @given(seeds)
@@ -267,8 +265,8 @@ def test_estimates_are_always_valid_variations(seed, count):
 @given(seeds, visits)
 def test_odds_follow_from_one_distribution(seed, visits):
     """Given an earlier level, the probabilities of the levels at the same place sum to 1."""
-    known = common(seed)
-    known = known._replace(heights=known.heights / known.heights.sum(axis=1, keepdims=True))
+    touching, heights = common(seed)
+    known = touching, heights / heights.sum(axis=1, keepdims=True)
     log = log_odds_table(known, visits)
     assert log.shape == (3, LEVELS, LEVELS)
     for group in range(3):
@@ -279,8 +277,8 @@ def test_odds_follow_from_one_distribution(seed, visits):
 @given(seeds, visits)
 def test_odds_favour_the_true_case_on_average(seed, visits):
     """Their mean is positive for pairs of one place and negative for pairs of two."""
-    known = common(seed)
-    known = known._replace(heights=known.heights / known.heights.sum(axis=1, keepdims=True))
+    touching, heights = common(seed)
+    known = touching, heights / heights.sum(axis=1, keepdims=True)
     log = log_odds_table(known, visits)[:, :DEAD, :DEAD]
     for group in range(3):
         anywhere = of_background(known, group)[:, None]
@@ -299,7 +297,7 @@ def test_a_dead_pixel_carries_no_evidence(seed, visits):
 
 @pytest.mark.parametrize("touching", [0.15, 0.4, 0.7])
 def test_the_likeliest_earlier_level_is_the_present_one(touching):
-    known = Background(np.array([touching]), np.full((1, HEIGHTS), 1 / HEIGHTS))
+    known = np.array([touching]), np.full((1, HEIGHTS), 1 / HEIGHTS)
     log = log_odds_table(known, PRIOR)[0]
     assert (log[:DEAD, :DEAD].argmax(axis=1) == np.arange(DEAD)).all()
     assert (np.diag(log)[:DEAD] > 0).all()
@@ -310,14 +308,14 @@ def test_the_likeliest_earlier_level_is_the_present_one(touching):
 def test_heights_that_are_all_outliers_leave_only_contact():
     known = common(0)
     log = log_odds_table(known, PRIOR._replace(outliers=1.0))[:, 1:DEAD, 1:DEAD]
-    expected = np.log((1 - PRIOR.vanishes) / known.touching)[:, None, None]
+    expected = np.log((1 - PRIOR.vanishes) / known[0])[:, None, None]
     assert np.allclose(log, expected)
 
 
 def test_a_rare_height_carries_more_evidence_than_a_common_one():
     heights = np.full(HEIGHTS, 0.2 / (HEIGHTS - 1))
     heights[25] = 0.8
-    log = log_odds_table(Background(np.array([0.4]), heights[None]), PRIOR)[0]
+    log = log_odds_table((np.array([0.4]), heights[None]), PRIOR)[0]
     assert log[6, 6] > log[26, 26]
 
 

@@ -10,12 +10,7 @@ import numpy as np
 
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.filter import recognise
-from ratslam.recall.memory import (
-    MapFeedback,
-    accumulate_motion,
-    apply_map_feedback,
-    init_memory,
-)
+from ratslam.recall.memory import MapFeedback, init_memory
 from ratslam.recall.observation_model import touch_likelihood
 from ratslam.recall.whisker_likelihood import DEAD, PRIOR, estimate_background, log_odds_table, pixel_layout
 from tests.ratslam.recall.recall_cases import SMALL, believing, holding, network_of
@@ -50,7 +45,7 @@ def filled(config, images, poses, likeness, *, scale=NEW_IMAGE_LOG_ODDS, dtype=f
     store = np.zeros((SIZE, CAPACITY), np.int32)
     store[:, :count] = images.T
     memory = memory._replace(view=jnp.asarray(store), count=jnp.int32(count))
-    return apply_map_feedback(memory, MapFeedback(poses, 0.0, 0.0, 0.0, np.pi, scale, likeness))
+    return memory.apply_map_feedback(MapFeedback(poses, 0.0, 0.0, 0.0, np.pi, scale, likeness))
 
 
 def spaced(count, cells=4.0):
@@ -75,7 +70,7 @@ def random_case(seed, config=BOTH):
     mass[:, :old] = stream.dirichlet(np.full(rows * old + 1, 0.3))[:-1].reshape(rows, old)
     memory = memory._replace(before=jnp.asarray(before))
     belief = believing(config, memory, mass, CELL, SMALL)
-    memory = accumulate_motion(memory, jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1])))
+    memory = memory.accumulate_motion(jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1])))
     near = images[stream.integers(0, max(old, 1))]
     return memory, belief, np.where(stream.random(SIZE) < 0.7, near, images_of(stream, 1)[0])
 

@@ -15,7 +15,7 @@ from ratslam.places.crop import keyframes_of_steps
 from ratslam.runs import merge as merging
 from ratslam.runs.map_care import crop_saved, undo_sequence
 from ratslam.runs.map_settings import differing_settings
-from ratslam.runs.merge import check_mergeable, merge_maps
+from ratslam.runs.merge import check_mergeable, describe_merge, merge_maps
 from ratslam.runs.saved_map import read_map, write_map
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
@@ -88,7 +88,7 @@ def test_common_steps_can_be_cut_out(halves, capsys, tmp_path: Path, monkeypatch
     assert main([*command[:-1], str(rest)]) == 0
     monkeypatch.setattr(merging, "join_all", lambda *_: [])
     other = late if command[2] == str(halves[0]) else halves[0]
-    assert merge_maps([rest, other], tmp_path / "both.npz").steps
+    assert merge_maps([rest, other], tmp_path / "both.npz")["steps"]
 
 
 def test_a_recording_is_mapped_once_whatever_the_settings(halves) -> None:
@@ -117,14 +117,13 @@ def test_settings_that_differ_are_told(halves, tmp_path: Path, monkeypatch) -> N
     config = saved.config.model_copy(update={"keyframes": keyframes})
     write_map(tmp_path / "two.npz", saved.open_session(), config, saved.source)
     report = merge_maps([halves[0], tmp_path / "two.npz"], tmp_path / "both.npz")
-    ((name, values),) = report.settings.items()
+    ((name, values),) = report["settings"].items()
     assert (name, sorted(values)) == ("keyframes.min_score", [saved.config.keyframes.min_score, 77.0])
     assert read_map(tmp_path / "both.npz").config.keyframes.min_score == values[0]
-    heading, line = report.describe().splitlines()[-2:]
-    assert str(report.maps[0]) in heading
+    heading, line = describe_merge(report).splitlines()[-2:]
+    assert report["maps"][0] in heading
     assert line == f"keyframes.min_score {values[0]} (map 2: {values[1]})"
-    assert report.to_json()["settings"] == {name: values}
-    assert merge_maps(halves, tmp_path / "alike.npz").settings == {}
+    assert merge_maps(halves, tmp_path / "alike.npz")["settings"] == {}
 
 
 def test_what_is_no_setting_of_the_method_may_differ() -> None:

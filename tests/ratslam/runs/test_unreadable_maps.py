@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 import ratslam
+from ratslam.core.backend import PathMap
 from ratslam.methods.config import LocaliseConfig
-from ratslam.methods.finished_map import map_file
+from ratslam.methods.finished_map import restore_map
 from ratslam.runs.localise import recorded_alike
 from ratslam.runs.map_care import map_info, undo_sequence
 from ratslam.runs.saved_map import read_map
@@ -61,8 +62,8 @@ def test_a_map_that_cannot_be_opened_says_why(tmp_path: Path, monkeypatch: pytes
 
 
 def test_a_run_directory_is_a_finished_map(tmp_path: Path) -> None:
-    assert map_file(LocaliseConfig(map=tmp_path)) == tmp_path / "map.npz"
-    assert map_file(LocaliseConfig(map=FILE)) == FILE
+    with pytest.raises(InputError, match=f"^{tmp_path / 'map.npz'}: no such file; expected the map in which"):
+        restore_map(LocaliseConfig(map=tmp_path), PathMap(), "recall")
 
 
 @pytest.mark.soak

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.tables import buildings, cycles, recordings, speed
+from evaluation.papers.tables import batches, buildings, cycles, recordings
 from evaluation.papers.tables import grid_table as grid
 from evaluation.papers.tables import touch_table as touch
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
@@ -258,8 +258,8 @@ def test_the_command_refuses_unknown_rows(capsys):
 
 def test_the_batch_table_times_networks_sets_and_sessions(monkeypatch):
     for name, value in {"BATCH_SIZES": (11,), "SINGLE": 4, "FEW": 4, "RECORDED": 2}.items():
-        monkeypatch.setattr(speed, name, value)
-    lines = list(speed.batch_table(sets=10, sessions=3, steps=40, rounds=1))
+        monkeypatch.setattr(batches, name, value)
+    lines = list(batches.batch_table(sets=10, sessions=3, steps=40, rounds=1))
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[1:]]
     assert [what.split(",")[0] for what, _, _ in rows] == [
         "one network of 11 cells a side", "one network of 11 cells a side", "2 sets of 21 cells",

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from ratslam.runs.settings.changed_settings import changed_settings
 from ratslam.runs.settings.packaged import read_citation
+from ratslam.runs.settings.run_config import changed_settings
 from tactile.base.errors import InputError
 
 CONFIG = """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.runs.settings.changed_settings import flat_settings
+from ratslam.runs.map_settings import flat_settings
 
 NAMES = st.text("abc_", min_size=1, max_size=3)
 SECTIONS = st.recursive(st.integers() | st.just({}), lambda inner: st.dictionaries(NAMES, inner, max_size=3))

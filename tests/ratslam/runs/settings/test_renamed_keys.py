@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.runs.settings.changed_settings import changed_settings
 from ratslam.runs.settings.renamed_keys import MOVED
-from ratslam.runs.settings.run_config import RunConfig, load_config
+from ratslam.runs.settings.run_config import RunConfig, changed_settings, load_config
 from ratslam.runs.settings.strict_yaml import parse
 from tactile.base.errors import InputError
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from evaluation.studies.machine import compilations
+from evaluation.studies.network_batch import SEGMENT, CellCourse, CellSets, walk
 from ratslam.classic import pose_cells
-from ratslam.classic.batch import SEGMENT, CellCourse, CellSets, Network, walk
 from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.excitation_inhibition import ring_difference
 from ratslam.classic.levels import to_full_torus, window_levels
@@ -22,8 +22,7 @@ CHOSEN = [18 * 441 + 10 * 21 + 10, 17 * 441 + 11 * 21 + 9, 0]
 
 
 def sets() -> CellSets:
-    columns = [np.array(column) for column in zip(*SETS, strict=True)]
-    return CellSets(Network(*columns[:4]), *columns[4:])
+    return CellSets(*(np.array(column) for column in zip(*SETS, strict=True)))
 
 
 def course(views: bool) -> CellCourse:

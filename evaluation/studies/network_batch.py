@@ -1,17 +1,15 @@
-"""Many sessions in one compiled call: parameter sets, seeds and noise levels of the published network.
+"""Many published networks over one long course: parameter sets and noise levels in one compiled call.
 
-Sessions are computed a few at a time, because all at once exceed the processor's cache; on a GPU blocks may
-be as large as its memory. `networks` and `trials` compute each from beginning to end. `walk` takes many
-networks over a long course, a segment at a time: at the smallest window level, and those that needed a larger
-one again from where the segment began, one by one with all levels. Its memory is that of the networks' states
-and of one segment.
+`walk` takes them over the course a segment at a time: at the smallest window level, and those that needed a
+larger one again from where the segment began, one by one with all levels. Networks are computed a few at a
+time, because all at once exceed the processor's cache. The memory is that of their states and of one segment.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,97 +19,34 @@ from jax import lax
 from ratslam.classic import pose_cells
 from ratslam.classic.cell_probe import activity_of
 from ratslam.classic.config import NetworkConfig, rings
-from ratslam.classic.levels import window_levels
+from ratslam.classic.excitation_inhibition import Window
+from ratslam.classic.levels import Level, window_levels
 from ratslam.classic.pose_cells import PoseCells
-from ratslam.core.estimates import Estimate
-from tactile.base.types import Array, Observation, Odometry
+from tactile.base.types import Array, Odometry
 
 BLOCK = 8
-"""Sessions of the pose cells computed at a time; they fit into a processor's cache."""
+"""Networks computed at a time; they fit into a processor's cache."""
 
 
-class Network(NamedTuple):
-    """B parameter sets of the pose cells.
+def tuned_levels(
+    levels: tuple[Level, ...], excite: Array, inhibit: Array, threshold: Array
+) -> tuple[Level, ...]:
+    """The levels with kernels of the same widths but other standard deviations, which may be traced.
 
-    Attributes:
-        excite_sigma, inhibit_sigma: [B] cells. global_inhibition: [B]. energy: [B] factor on the injected
-            energy.
+    Args:
+        excite, inhibit: standard deviations, cells. threshold: global inhibition.
     """
 
-    excite_sigma: Array
-    inhibit_sigma: Array
-    global_inhibition: Array
-    energy: Array
+    def kernel(like: Array, sigma: Array) -> Array:
+        offset = (np.arange(len(like)) - len(like) // 2).astype(sigma.dtype)
+        weight = jnp.exp(offset**2 / (-2 * sigma**2))
+        return weight / weight.sum()
 
+    def tuned(window: Window) -> Window:
+        kernels = kernel(window.excite, excite), kernel(window.inhibit, inhibit)
+        return window._replace(excite=kernels[0], inhibit=kernels[1], sigma=excite, threshold=threshold)
 
-class Course(NamedTuple):
-    """Input of the pose cells over T steps.
-
-    Attributes:
-        motion: [T, 3] body-frame odometry, m, m, rad. recall: [T, 3] recalled poses, cells. energy: [T]
-            injected there.
-    """
-
-    motion: Array
-    recall: Array
-    energy: Array
-
-
-Track = tuple[Array, Array, Array]
-"""Decoded packets [B, T, 3] in cells, outcome [B, T] and window level [B, T]."""
-
-
-def networks(config: NetworkConfig, sets: Network, course: Course, block: int = BLOCK) -> Track:
-    """The pose cells with every parameter set over one course, in the precision of the course.
-
-    All sets are computed at the smallest window level first; those that needed a larger one are computed
-    again with all levels, which in a batch cost time even where they are not used.
-    """
-    track = jax.tree.map(np.array, _networks(config, 1, sets, course, block))
-    again = np.flatnonzero(np.any(track[2] > 0, axis=1))
-    if len(again):
-        room = np.resize(again, 1 << (len(again) - 1).bit_length())  # few shapes to compile
-        chosen = jax.tree.map(lambda column: jnp.asarray(column)[room], sets)
-        # All levels: one by one a set takes the time of its own level; at once, as on a GPU, that of all.
-        whole = _networks(config, None, chosen, course, 1 if block <= BLOCK else block)
-        for rows, exact in zip(track, whole, strict=True):
-            rows[again] = np.asarray(exact)[: len(again)]
-    return track
-
-
-@partial(jax.jit, static_argnames=("config", "levels", "block"))
-def _networks(config: NetworkConfig, levels: int | None, sets: Network, course: Course, block: int) -> Track:
-    dtype = np.dtype(course.motion.dtype)
-    used = window_levels(config, dtype)[:levels]
-
-    def simulate(network: Network) -> Track:
-        kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
-        tuned = tuple(level._replace(window=level.window.with_kernels(*kernels)) for level in used)
-
-        def step(cells: Any, row: Course) -> Any:
-            odometry = Odometry(row.motion[0], row.motion[1], row.motion[2], jnp.ones((), dtype))
-            energy = row.energy * network.energy
-            cells, (_, outcome, level) = pose_cells.step(config, tuned, cells, odometry, row.recall, energy)
-            return cells, (cells.pose, outcome, level)
-
-        return lax.scan(step, pose_cells.start(config, dtype, used), course)[1]
-
-    return lax.map(simulate, sets, batch_size=block)
-
-
-@partial(jax.jit, static_argnames=("kernel", "block"))
-def trials(kernel: Any, states: Any, observations: Observation, block: int = 1) -> Estimate:
-    """Estimates [B, T, ...] of one kernel from B states (one for each seed) over B courses of observations
-    [B, T] (one for each noise level)."""
-
-    def simulate(trial: Any) -> Estimate:
-        def step(state: Any, observation: Observation) -> Any:
-            state, estimate, _ = kernel(state, observation)
-            return state, estimate
-
-        return lax.scan(step, *trial)[1]
-
-    return lax.map(simulate, (states, observations), batch_size=block)
+    return tuple(level._replace(window=tuned(level.window)) for level in levels)
 
 
 SEGMENT = 128
@@ -125,11 +60,15 @@ class CellSets(NamedTuple):
     """B networks and the noise on their odometry.
 
     Attributes:
-        network: their parameters. speed_noise: [B] standard deviation of a step's motion, as a share of it.
-            heading_noise: [B] of the heading, rad / sqrt(s).
+        excite_sigma, inhibit_sigma: [B] cells. global_inhibition: [B]. energy: [B] factor on the injected
+            energy. speed_noise: [B] standard deviation of a step's motion, as a share of it. heading_noise:
+            [B] of the heading, rad / sqrt(s).
     """
 
-    network: Network
+    excite_sigma: Array
+    inhibit_sigma: Array
+    global_inhibition: Array
+    energy: Array
     speed_noise: Array
     heading_noise: Array
 
@@ -268,9 +207,7 @@ def _walk(
     ring = rings(config, dtype)
 
     def simulate(own: CellSets, walker: Walker) -> tuple[Walker, CellTrack]:
-        network = own.network
-        kernels = network.excite_sigma, network.inhibit_sigma, network.global_inhibition
-        tuned = tuple(level._replace(window=level.window.with_kernels(*kernels)) for level in levels)
+        tuned = tuned_levels(levels, own.excite_sigma, own.inhibit_sigma, own.global_inhibition)
 
         def step(walker: Walker, row: CellCourse) -> tuple[Walker, CellTrack]:
             cells, packet = walker
@@ -282,7 +219,7 @@ def _walk(
             # A template is learnt with the packet before the step.
             packet = packet.at[row.template].set(jnp.where(row.novel, cells.pose, seen))
             turned = jnp.stack([jnp.zeros_like(row.turned), jnp.zeros_like(row.turned), row.turned])
-            recall, energy = (seen + turned) % ring, row.energy * network.energy
+            recall, energy = (seen + turned) % ring, row.energy * own.energy
             cells, (_, outcome, level) = pose_cells.step(config, tuned, cells, moved, recall, energy)
             active = activity_of(levels, cells.activity, np.array(chosen, np.int32))
             return (cells, packet), CellTrack(cells.pose, active, outcome, level)
