@@ -8,8 +8,6 @@ growing lengths; every row is on disk as soon as it is measured.
 
 from __future__ import annotations
 
-import csv
-import io
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -36,27 +34,27 @@ from evaluation.studies.machine import (
     reset_peak_memory,
     watch_load,
 )
-from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE
+from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE, closure_errors
 from evaluation.studies.perturbation import repeat_course
-from evaluation.studies.run_job import KILLED
-from evaluation.studies.study import with_settings
+from evaluation.studies.run_job import KILLED, read_records
+from evaluation.studies.study import preset_settings, with_settings
 from evaluation.studies.study_report import (
+    csv_text,
     describe_machines,
     find_disturbances,
     format_number,
     render_table,
+    save_files,
 )
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.settings.strict_yaml import Document, load, override, validate
-from ratslam.runs.settings.yaml_document import Place
+from ratslam.runs.settings.strict_yaml import load, override, validate
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.sources.in_memory import load_into_memory
 from robot.world.maze import winding_loop
 from robot.world.scene import PAPER_CIRCUITS, PathConfig
 from tactile.base.errors import InputError, os_errors_of
-from tactile.base.files import write_atomically, write_text_atomically
 from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
 from tactile.base.settings import Settings
@@ -111,10 +109,8 @@ def growth_study(path: Path, overrides: Sequence[str] = ()) -> tuple[str, list[G
     Raises:
         InputError: the configuration is invalid, or the ground is too small.
     """
-    own = [text for text in overrides if text.partition("=")[0] in GrowthPlan.model_fields]
-    empty = Document({}, {(): Place("--preset growth", "--preset growth")})
-    plan = validate(override(empty, own), GrowthPlan)
-    document = override(load(path), [text for text in overrides if text not in own])
+    plan, others = preset_settings(GrowthPlan, "growth", overrides)
+    document = override(load(path), others)
     config = validate(document, RunConfig).with_absolute_paths(path.parent.resolve())
     whiskers = config.simulation is not None
     tasks = []
@@ -292,12 +288,11 @@ def _errors(session: Session, truth: np.ndarray, odometry: np.ndarray) -> dict[s
     began = thread_time()
     final, end = session.map.trajectory(), thread_time() - began
     closures = session.map.closures()
-    apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
     return {
         "end": end,
         "energy_odometry": energy_all_pairs(odometry, truth).total,
         "closures": len(closures),
-        "false_closures": int((apart > FALSE_CLOSURE_DISTANCE).sum()),
+        "false_closures": int((closure_errors(truth, closures) > FALSE_CLOSURE_DISTANCE).sum()),
         "energy": energy_all_pairs(online, truth).total,
         "ate": ate(online, truth),
         "energy_final": energy_all_pairs(final, truth).total,
@@ -341,13 +336,7 @@ def run_growth(tasks: Sequence[GrowthTask], folder: Path) -> None:
 
 def read_rows(folder: Path) -> list[_GrowthRow]:
     """The rows measured so far."""
-    path, found = folder / FILE, []
-    for line in path.read_bytes().splitlines() if path.exists() else []:
-        try:
-            found.append(_GrowthRow.model_validate_json(line))
-        except ValueError:  # cut off by a kill
-            continue
-    return found
+    return read_records(folder / FILE, _GrowthRow)
 
 
 def render_growth(rows: Sequence[_GrowthRow]) -> str:
@@ -394,19 +383,8 @@ def _draw(name: str, rows: Sequence[_GrowthRow]) -> Figure | None:
 def save_growth(name: str, rows: Sequence[_GrowthRow], folder: Path) -> list[Path]:
     """Writes table.csv, table.md and, if there is something to draw, growth.png."""
     lines = [row.model_dump(exclude={"machine"}) | {"other_load": row.machine.other_load} for row in rows]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    write_text_atomically(folder / "table.csv", text.getvalue())
-    write_text_atomically(folder / "table.md", f"{render_growth(rows)}\n")
-    paths, picture = [folder / "table.csv", folder / "table.md"], folder / "growth.png"
-    figure = _draw(name, rows)
-    if figure is None:
-        picture.unlink(missing_ok=True)  # of an earlier call
-        return paths
-    write_atomically(picture, figure.savefig)
-    return [*paths, picture]
+    figure, table = _draw(name, rows), f"{render_growth(rows)}\n"
+    return save_files(folder, {"table.csv": csv_text(lines), "table.md": table, "growth.png": figure})
 
 
 def _append_rows(path: Path, task: GrowthTask) -> str | None:

@@ -156,16 +156,15 @@ def touch_metrics(result: SessionResult, exm: ExmConfig | None = None) -> TouchM
         arcr_chain_free=metric.arcr_chain_free if metric else np.nan,
         relocalisations=metric.relocalisations if metric else 0,
         closures=len(result.closures),
-        false_closures=int((closure_errors(result) > FALSE_CLOSURE_DISTANCE).sum()),
+        false_closures=int((closure_errors(truth, result.closures) > FALSE_CLOSURE_DISTANCE).sum()),
         experiences=len(result.node),
         steps=len(truth),
     )
 
 
-def closure_errors(result: SessionResult) -> np.ndarray:
-    """[K] true distance between the two steps of each closure, m."""
-    later, earlier = result.truth[result.closures[:, 0]], result.truth[result.closures[:, 1]]
-    return np.hypot(*(later - earlier)[:, :2].T)
+def closure_errors(truth: np.ndarray, closures: np.ndarray) -> np.ndarray:
+    """[K] true distance between the two steps of each closure [K, 2], m, by true poses [T, 3]."""
+    return np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
 
 
 def experience_metric_if_defined(

@@ -181,6 +181,7 @@ class StudyPlan(Settings):
 
 
 Model = TypeVar("Model", bound=BaseModel)
+Preset = TypeVar("Preset", bound=Settings)
 MOST = 100_000  # largest number of jobs of a study
 SEEDS = {
     "simulation": "simulation.seed",
@@ -347,6 +348,14 @@ def _outermost_first(keys: Iterable[str]) -> list[str]:
 def is_study_key(assignment: str) -> bool:
     """Whether `a.b=value` sets a key of the study; else it is a setting of all runs."""
     return assignment.partition("=")[0].split(".")[0] in StudyPlan.model_fields
+
+
+def preset_settings(plan: type[Preset], name: str, overrides: Sequence[str]) -> tuple[Preset, list[str]]:
+    """The settings of a preset that is no study file, and the overrides `a.b=value` of the configuration:
+    those that set no key of the preset."""
+    own = [text for text in overrides if text.partition("=")[0] in plan.model_fields]
+    empty = Document({}, {(): Place(f"--preset {name}", f"--preset {name}")})
+    return validate(override(empty, own), plan), [text for text in overrides if text not in own]
 
 
 def _check_unambiguous(plan: StudyPlan, document: Document, overridden: Collection[str]) -> None:

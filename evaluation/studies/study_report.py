@@ -397,16 +397,42 @@ def _draw(report: _Report) -> Figure | None:
 
 def save_report(report: _Report, directory: Path) -> list[Path]:
     """Writes table.csv, table.json and table.md, and pareto.png where there is something to _draw."""
-    content = json.dumps(asdict(report), indent=1, allow_nan=False) + "\n"
-    paths = [directory / f"table.{kind}" for kind in ("csv", "json", "md")]
-    for path, text in zip(paths, (_csv(report), content, f"{render(report)}\n"), strict=True):
-        write_text_atomically(path, text)
-    picture, figure = directory / "pareto.png", _draw(report)
-    if figure is None:
-        picture.unlink(missing_ok=True)  # of an earlier call
-        return paths
-    write_atomically(picture, figure.savefig)
-    return [*paths, picture]
+    lines, figure = [], _draw(report)
+    for row in report.rows:
+        cells = {name: getattr(row, name) for name in ("row", "runs", "failed", "steps")}
+        cells |= {key: plain(value) for key, value in row.varied.items()} | {"optimal": int(row.optimal)}
+        for name, found in row.spreads.items():
+            cells |= {f"{name}_{part}": value for part, value in asdict(found).items() if part != "values"}
+        lines.append(cells)
+    files = {
+        "table.csv": csv_text(lines),
+        "table.json": json.dumps(asdict(report), indent=1, allow_nan=False) + "\n",
+        "table.md": f"{render(report)}\n",
+        "pareto.png": figure,
+    }
+    return save_files(directory, files)
+
+
+def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows by column as CSV, with the columns of all rows."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(chain.from_iterable(rows))), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def save_files(folder: Path, files: Mapping[str, Any]) -> list[Path]:
+    """Writes texts, figures, and what functions write to a path, into the folder of a study; returns their
+    paths. A file that is None is not written, and that of an earlier call goes."""
+    for name, content in files.items():
+        if content is None:
+            (folder / name).unlink(missing_ok=True)
+        elif isinstance(content, str):
+            write_text_atomically(folder / name, content)
+        else:
+            write_atomically(folder / name, getattr(content, "savefig", content))
+    return [folder / name for name, content in files.items() if content is not None]
 
 
 def _cell(found: _Spread | None, kind: str, base: _Spread | None) -> str:
@@ -494,18 +520,3 @@ def _kept(rows: Sequence[_Row], limit: float | None) -> list[str]:
     finals = [row.spreads.get("ate_final") for row in others]
     kept = sum(final is not None and final.high <= most for final in finals)
     return [f"{kept} of {len(others)} rows ({kept / len(others):.0%}) end at an ATE of {most:.3g} m or less"]
-
-
-def _csv(report: _Report) -> str:
-    lines = []
-    for row in report.rows:
-        cells = {name: getattr(row, name) for name in ("row", "runs", "failed", "steps")}
-        cells |= {key: plain(value) for key, value in row.varied.items()} | {"optimal": int(row.optimal)}
-        for name, found in row.spreads.items():
-            cells |= {f"{name}_{part}": value for part, value in asdict(found).items() if part != "values"}
-        lines.append(cells)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(chain.from_iterable(lines))), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    return text.getvalue()

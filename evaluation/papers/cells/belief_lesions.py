@@ -223,7 +223,7 @@ def _run_lesion(task: _LesionTask) -> _LesionFigures:
             true = int((claims.accepted & (claims.distance <= FALSE_DISTANCE)).sum())
             return _LesionFigures(None, np.flatnonzero(claims.accepted)[:, None], true)
         result, figures = run_and_measure(TouchTask(task.row, task.maze), new_session)
-    true = int((closure_errors(result) <= FALSE_CLOSURE_DISTANCE).sum())
+    true = int((closure_errors(result.truth, result.closures) <= FALSE_CLOSURE_DISTANCE).sum())
     return _LesionFigures(figures, result.closures, true)
 
 

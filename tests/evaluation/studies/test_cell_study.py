@@ -80,14 +80,14 @@ def test_without_noise_the_packet_follows_the_truth(box):
     study = cell_study(box(), ["steps=200", "sets=1", "precision=float64"])
     one = [np.array([value]) for value in (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0)]
     scores = score_sets(study.course, CellSets(Network(*one[:4]), *one[4:]), np.dtype(float))
-    assert scores.drift[0] < 0.02  # a fifth of a cell
-    assert scores.drift_heading[0] < 0.05
-    assert scores.decoding[0] <= scores.drift[0]
-    assert not scores.reseeded.any()
+    assert scores["drift"][0] < 0.02  # a fifth of a cell
+    assert scores["drift_heading"][0] < 0.05
+    assert scores["decoding"][0] <= scores["drift"][0]
+    assert not scores["reseeded"].any()
     course = study.course
     visited = np.bincount(course.bin, minlength=400).reshape(20, 20) > 0
-    assert (np.isfinite(scores.maps[0]) == visited).all()
-    assert (np.nanmax(scores.maps[0], axis=(1, 2)) > 1e-3).all()  # each cell lies on the way
+    assert (np.isfinite(scores["maps"][0]) == visited).all()
+    assert (np.nanmax(scores["maps"][0], axis=(1, 2)) > 1e-3).all()  # each cell lies on the way
 
 
 def test_expected_poses_start_in_the_middle_of_the_torus_and_keep_lengths(box):
@@ -163,8 +163,8 @@ def test_bytes_do_not_depend_on_interrupts(box, tmp_path):
         again = run_cell_study(study, tmp_path / "one", executor, counted.append)
     assert chunks(tmp_path / "one") == alone
     assert counted == [2, 2]
-    for a, b in zip(scores, again, strict=True):
-        assert np.array_equal(a, b, equal_nan=True)
+    for name, column in scores.items():
+        assert np.array_equal(column, again[name], equal_nan=True)
 
 
 def test_a_larger_study_computes_only_what_is_new(box, tmp_path):
@@ -174,7 +174,7 @@ def test_a_larger_study_computes_only_what_is_new(box, tmp_path):
         scores = run_cell_study(cell_study(box(), [*SMALL, "sets=5"]), tmp_path, executor)
     assert before.items() < chunks(tmp_path).items()
     assert len(chunks(tmp_path)) == 3
-    assert scores.maps.shape == (5, 8, 5, 5)
+    assert scores["maps"].shape == (5, 8, 5, 5)
 
 
 def test_the_program_writes_table_maps_and_pictures(box, tmp_path, capsys):
