@@ -18,7 +18,7 @@ import numpy as np
 
 from evaluation.artifacts.manifest import RUNNING, read_manifest
 from evaluation.artifacts.run_reader import check_run_directory, checkpoint_steps, read_walls
-from evaluation.metrics.run_metrics import DOUBTED
+from evaluation.metrics.run_metrics import DOUBTED, path_length
 from evaluation.metrics.trajectory import align
 from evaluation.plots import style
 from evaluation.plots.map_plot import NO_WALLS, draw_walls, split_at_jumps
@@ -67,6 +67,11 @@ class RunProgress(NamedTuple):
     warnings: tuple[str, ...] = ()
 
     @property
+    def length(self) -> float:
+        """Length of the path by odometry from the start of the run, m."""
+        return path_length(np.concatenate([np.zeros((1, 3)), self.odometry]))
+
+    @property
     def step_count(self) -> str:
         """Number of steps as text."""
         count = len(self.path)
@@ -74,7 +79,7 @@ class RunProgress(NamedTuple):
 
     def status_line(self, pace: float | None) -> str:
         """The state of a run in one line; `pace` is in steps per second."""
-        parts = [f"{self.name}: {self.status}", self.step_count, f"{path_length(self.odometry):.1f} m"]
+        parts = [f"{self.name}: {self.status}", self.step_count, f"{self.length:.1f} m"]
         parts += [] if pace is None else [f"{pace:.0f} steps/s"]
         parts += [] if self.online_error is None else [f"error {self.online_error:.3g} m"]
         parts += [
@@ -280,11 +285,6 @@ def watch_run(
             return seen
         before, last = seen, began
         time.sleep(max(every, REST_FACTOR * (time.monotonic() - began)))
-
-
-def path_length(odometry: np.ndarray) -> float:
-    """Length of the path by odometry [N, 3] from the start of the run, m."""
-    return float(np.hypot(*np.diff(odometry[:, :2], axis=0, prepend=np.zeros((1, 2))).T).sum())
 
 
 _HEIGHT, _BOTTOM, _COUNTS = 6.4, 0.95, 1.55  # inches: total height, below the map, and width of the counts

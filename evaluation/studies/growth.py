@@ -127,16 +127,13 @@ def growth_study(path: Path, overrides: Sequence[str] = ()) -> tuple[str, list[G
 def _with_laps(config: RunConfig, steps: int) -> RunConfig:
     """The configuration with its circuits repeated for at least so many steps."""
     assert config.simulation is not None
-    word = config.simulation.path.circuits or PAPER_CIRCUITS
-    laps, loop = 1, config.simulation.path.loop
+    word, loop = config.simulation.path.circuits or PAPER_CIRCUITS, config.simulation.path.loop
 
-    def repeated() -> RunConfig:
+    def repeated(laps: int) -> RunConfig:
         circuits = (word * ceil(laps / len(word)))[:laps]
         return with_settings(config, {"simulation.path": PathConfig(circuits=circuits, loop=loop)})
 
-    while (length := _length(found := repeated())) < steps:
-        laps = max(laps + 1, ceil(SPARE * laps * steps / length))
-    return found
+    return _lengthened(repeated, 1, steps)
 
 
 def with_new_ground(config: RunConfig, steps: int) -> RunConfig:
@@ -147,15 +144,23 @@ def with_new_ground(config: RunConfig, steps: int) -> RunConfig:
     maze = config.simulation.maze.model_copy(update=size)
     seed = config.simulation.seed if maze.seed is None else maze.seed
     loop = tuple(winding_loop(SIDE, SIDE, stream(seed, "growth.route")))
-    cells = 8
-    while True:
+
+    def visiting(cells: int) -> RunConfig:
         path = PathConfig(cells=loop[:cells], loop=loop)
-        found = with_settings(config, {"simulation.maze": maze, "simulation.path": path})
-        if (length := _length(found)) >= steps:
-            return found
-        if cells == len(loop):
+        return with_settings(config, {"simulation.maze": maze, "simulation.path": path})
+
+    return _lengthened(visiting, 8, steps, len(loop))
+
+
+def _lengthened(
+    made: Callable[[int], RunConfig], count: int, steps: int, most: int = sys.maxsize
+) -> RunConfig:
+    """What is made of a number of laps or cells, from `count` on, that suffices for so many steps."""
+    while (length := _length(found := made(count))) < steps:
+        if count == most:
             raise InputError("new_ground", f"{steps} steps", f"at most {length}, a visit of every cell")
-        cells = min(max(cells + 1, ceil(SPARE * cells * steps / length)), len(loop))
+        count = min(max(count + 1, ceil(SPARE * count * steps / length)), most)
+    return found
 
 
 def _length(config: RunConfig) -> int:
