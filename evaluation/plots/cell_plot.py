@@ -10,13 +10,13 @@ from evaluation.cells.information import information
 from evaluation.cells.rate_map import known_poses, rate_maps, recorded_sums, tuning_curves
 from evaluation.cells.recording import BinnedSums, CellRecording
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION, WIDTH
+from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION
 from tactile.base.errors import InputError
 
 MOST = 12
 """Largest number of cells in a plot of a run."""
 _COLUMNS, _GAP = 6, 0.14  # panels in a row; inches between them
-_SIDE = (WIDTH - style.LEFT - style.RIGHT - (_COLUMNS - 1) * _GAP) / _COLUMNS  # of a map, inches
+_SIDE = (style.INNER - (_COLUMNS - 1) * _GAP) / _COLUMNS  # of a map, inches
 _DIAL = 0.62 * _SIDE  # of a tuning curve, inches
 _LABEL = 0.5  # inches above a map
 

@@ -306,7 +306,7 @@ def _draw_scores(
     rows = -(-len(parameters) // _COLUMNS)
     height = style.TOP + rows * (_PANEL + _GAP_UP)
     figure = style.new_figure(height, title, line)
-    width = (WIDTH - style.LEFT - style.RIGHT - (_COLUMNS - 1) * _GAP_ACROSS) / _COLUMNS
+    width = (style.INNER - (_COLUMNS - 1) * _GAP_ACROSS) / _COLUMNS
     for k, (name, values) in enumerate(parameters.items()):
         row, column = divmod(k, _COLUMNS)
         left = style.LEFT + column * (width + _GAP_ACROSS)
@@ -337,7 +337,7 @@ def _draw_rate_maps(
             [W + 1], [H + 1] edges of the place bins, m.
     """
     columns = max(map(len, rows.values()))
-    side = (WIDTH - style.LEFT - style.RIGHT - (columns - 1) * _MAP_GAP) / columns
+    side = (style.INNER - (columns - 1) * _MAP_GAP) / columns
     step = side + 0.5
     height = style.TOP + len(rows) * step + 0.1
     figure = style.new_figure(height, title, line)

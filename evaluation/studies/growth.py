@@ -24,7 +24,7 @@ from pydantic import Field, PositiveInt
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import ate
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, GREEN, PURPLE, VERMILLION, WIDTH
+from evaluation.plots.style import BLUE, GREEN, PURPLE, VERMILLION
 from evaluation.studies.executor import Executor
 from evaluation.studies.machine import (
     Machine,
@@ -368,10 +368,7 @@ def _draw(name: str, rows: Sequence[_GrowthRow]) -> Figure | None:
     steps = np.array([row.steps for row in timed])
     measured = describe_machines([row.machine for row in rows], 1)
     line = "  ·  ".join(measured[part] for part in ("machine", "build"))
-    inner = WIDTH - style.LEFT - style.RIGHT
-    title = f"Cost of a step against length: {name}"
-    figure = style.new_figure(style.TOP + _TALL + _BOTTOM, title, line)
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _TALL)
+    figure, axes = style.new_chart(_TALL, _BOTTOM, f"Cost of a step against length: {name}", line)
     style.log_axes(axes, steps, cost.ravel())
     for ground, color in zip(grounds, _COLORS, strict=False):
         these = [row.ground == ground for row in timed]

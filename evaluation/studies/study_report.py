@@ -23,7 +23,7 @@ import numpy as np
 from evaluation.metrics.metric import Direction
 from evaluation.metrics.statistics import pareto_optimal
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION, WIDTH
+from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION
 from evaluation.studies.machine import Machine
 from evaluation.studies.metrics import COLUMNS, DEFAULT_ERRORS, MEASURED, METRICS
 from evaluation.studies.run_job import RunRecord
@@ -172,10 +172,7 @@ def draw_pareto(title: str, line: str, marks: Sequence[ParetoPoint], time: str, 
     Args:
         marks: at least one point. time, error: axis labels with units.
     """
-    inner = WIDTH - style.LEFT - style.RIGHT
-    tall = _TALL + _EACH * max(0, len(marks) - 12)
-    figure = style.new_figure(style.TOP + tall + _BOTTOM, title, line)
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, tall)
+    figure, axes = style.new_chart(_TALL + _EACH * max(0, len(marks) - 12), _BOTTOM, title, line)
     spans = np.array([[mark.time, mark.error] for mark in marks])  # [N, 2, 3]
     positive = spans[:, 1][spans[:, 1] > 0]
     floor = _FLOOR * positive.min() if len(positive) else 1.0

@@ -14,7 +14,6 @@ from evaluation.metrics.occupancy_grid import PRIOR_OCCUPANCY, GridTruth, Occupa
 from evaluation.metrics.occupancy_score import score_grid
 from evaluation.plots.grid_plot import (
     GridPanel,
-    GridPaths,
     draw_grid,
     draw_grids,
     grid_headline,
@@ -26,7 +25,7 @@ SIDE = np.array(
 )
 TURN = np.linspace(0, 9, 80)
 WAY = 0.4 * np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
-PATHS = GridPaths(WAY, WAY + [0.03, 0.04], WAY * 3)
+PATHS = (WAY, WAY + [0.03, 0.04], WAY * 3)
 
 
 def grid(height=50, width=50, seed=0):
