@@ -42,11 +42,7 @@ class ClosureTable(NamedTuple):
 
 
 def read_closure_table(directory: Path) -> ClosureTable:
-    """Reads the closures of a run directory; none without the file.
-
-    Raises:
-        InputError: a line is malformed.
-    """
+    """Reads the closures of a run directory; none without the file."""
     file = directory / "closures.csv"
     if not file.exists():
         return ClosureTable(np.zeros((0, 2), int), [], {})
@@ -68,11 +64,7 @@ def read_closure_table(directory: Path) -> ClosureTable:
 
 
 def read_closures(directory: Path) -> np.ndarray:
-    """The pairs of steps [n, 2] of this run that are joined by accepted closures; n is 0 without the file.
-
-    Raises:
-        InputError: a line is malformed.
-    """
+    """The pairs of steps [n, 2] of this run that are joined by accepted closures; n is 0 without the file."""
     table = read_closure_table(directory)
     return table.steps[table.accepted() & (table.steps >= 0).all(axis=1)]
 
@@ -153,9 +145,5 @@ def write_changes(path: Path, changes: Sequence[ChangeRow]) -> None:
 
 
 def read_changes(path: Path) -> list[ChangeRow]:
-    """Reads the places.
-
-    Raises:
-        InputError: a line is malformed.
-    """
+    """Reads the places."""
     return read_rows(path, f"the columns {', '.join(COLUMNS)}", ChangeRow.parse)

@@ -39,11 +39,7 @@ class Manifest(NamedTuple):
 
 
 def read_manifest(directory: Path) -> Manifest:
-    """Reads the manifest; that of a run without the file has no versions.
-
-    Raises:
-        InputError: the file, or the report of a live session, is malformed.
-    """
+    """Reads the manifest; that of a run without the file has no versions."""
     file = directory / "manifest.json"
     found = read_json(file, "the manifest of a run", _parse) if file.exists() else Manifest()
     if found.status != RUNNING:

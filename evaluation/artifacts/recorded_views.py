@@ -40,11 +40,7 @@ def write_closure_views(path: Path, views: ClosureViews) -> None:
 
 
 def read_closure_views(directory: Path) -> ClosureViews | None:
-    """Reads the views of a run directory; None without the file.
-
-    Raises:
-        InputError: the file is malformed.
-    """
+    """Reads the views of a run directory; None without the file."""
 
     def parse(step: np.ndarray, view: np.ndarray) -> ClosureViews:
         if step.ndim != 1 or view.ndim != 3 or len(step) != len(view) or view.dtype != np.uint8:
@@ -86,11 +82,7 @@ def write_whisker_views(path: str | Path, images: WhiskerViews) -> None:
 
 
 def read_whisker_views(path: str | Path) -> WhiskerViews:
-    """The inverse of `write_whisker_views`, except for rounding.
-
-    Raises:
-        InputError: the file is missing or malformed.
-    """
+    """The inverse of `write_whisker_views`, except for rounding."""
 
     def parse(view: np.ndarray, *arrays: np.ndarray) -> WhiskerViews:
         alive, azimuth, length, tallest = arrays

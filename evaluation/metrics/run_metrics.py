@@ -21,7 +21,7 @@ from evaluation.metrics.energy_metric import (
     successive_pairs,
 )
 from evaluation.metrics.exm import EXM_MODES, ExmConfig, base_end, change_rows, experience_metric
-from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
+from evaluation.metrics.metric import Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.trajectory import (
     align,
@@ -139,10 +139,6 @@ class RunData(NamedTuple):
     findings: dict[str, Finding]
 
 
-def _metric(section: str, direction: Direction, name: str, label: str, unit: str = "") -> Metric:
-    return Metric(name, label, unit, direction, section, lambda data: data.findings.get(name))
-
-
 _PAIRS = {
     "change": "successive experience changes",
     "consecutive": "consecutive steps",
@@ -154,35 +150,35 @@ PIECES = "Pieces"
 """Heading of the metrics of a map in several pieces."""
 _PARTS = (("", "", "m2+rad2"), ("_trans2", ", trans", "m2"), ("_rot2", ", rot", "rad2"))
 RUN_METRICS: tuple[Metric, ...] = (
-    _metric("Extent", None, "steps", "steps"),
-    _metric("Extent", None, "duration", "duration", "s"),
-    _metric("Extent", None, "path", "length of the true path", "m"),
-    _metric("Extent", None, "experiences", "experiences"),
-    _metric("Extent", None, "links", "links"),
-    _metric("Health", None, "map_doubt", "map worse than odometry, probability"),
-    _metric(PIECES, None, "pieces", "pieces that nothing joins"),
-    _metric(PIECES, "low", "unjoined_share", "share of steps outside the largest piece"),
-    _metric(PIECES, "low", "energy_within_pieces", "Energy Metric within pieces", "m2+rad2"),
-    _metric(PIECES, "low", "ate_within_pieces", "ATE within pieces", "m"),
-    _metric("Trajectory", "low", "ate_final", "ATE, final", "m"),
-    _metric("Trajectory", "low", "ate_online", "ATE, online", "m"),
-    _metric("Trajectory", "low", "anytime_median", "online error, median", "m"),
-    _metric("Trajectory", "low", "anytime_late", "online error, RMS of the second half", "m"),
-    _metric("Trajectory", "low", "anytime_jump", "online error, largest jump", "m"),
-    _metric("Trajectory", "low", "rpe_translation", "RPE over one step, translation", "m"),
-    _metric("Trajectory", "low", "rpe_rotation_deg", "RPE over one step, rotation", "deg"),
-    _metric("Trajectory", "low", "relations_translation", "relations file, translation", "m"),
-    _metric("Trajectory", "low", "relations_rotation_deg", "relations file, rotation", "deg"),
+    Metric("steps", "steps", "", None, "Extent"),
+    Metric("duration", "duration", "s", None, "Extent"),
+    Metric("path", "length of the true path", "m", None, "Extent"),
+    Metric("experiences", "experiences", "", None, "Extent"),
+    Metric("links", "links", "", None, "Extent"),
+    Metric("map_doubt", "map worse than odometry, probability", "", None, "Health"),
+    Metric("pieces", "pieces that nothing joins", "", None, PIECES),
+    Metric("unjoined_share", "share of steps outside the largest piece", "", "low", PIECES),
+    Metric("energy_within_pieces", "Energy Metric within pieces", "m2+rad2", "low", PIECES),
+    Metric("ate_within_pieces", "ATE within pieces", "m", "low", PIECES),
+    Metric("ate_final", "ATE, final", "m", "low", "Trajectory"),
+    Metric("ate_online", "ATE, online", "m", "low", "Trajectory"),
+    Metric("anytime_median", "online error, median", "m", "low", "Trajectory"),
+    Metric("anytime_late", "online error, RMS of the second half", "m", "low", "Trajectory"),
+    Metric("anytime_jump", "online error, largest jump", "m", "low", "Trajectory"),
+    Metric("rpe_translation", "RPE over one step, translation", "m", "low", "Trajectory"),
+    Metric("rpe_rotation_deg", "RPE over one step, rotation", "deg", "low", "Trajectory"),
+    Metric("relations_translation", "relations file, translation", "m", "low", "Trajectory"),
+    Metric("relations_rotation_deg", "relations file, rotation", "deg", "low", "Trajectory"),
     *(
-        _metric("Energy Metric", "low", f"energy_{pairs}{suffix}", label + part, unit)
+        Metric(f"energy_{pairs}{suffix}", label + part, unit, "low", "Energy Metric")
         for pairs, label in _PAIRS.items()
         for suffix, part, unit in _PARTS
     ),
-    _metric("Experience Metric", None, "exm_base", "base set", "entries"),
-    _metric("Experience Metric", "high", "exm_arr", "ARR"),
-    *(_metric("Experience Metric", "high", f"exm_arcr_{mode}", f"ARCR, {mode}") for mode in EXM_MODES),
-    _metric("Experience Metric", "high", "exm_action_arr", "ARR, per action"),
-    _metric("Experience Metric", "high", "exm_action_arcr_strict", "ARCR, strict, per action"),
+    Metric("exm_base", "base set", "entries", None, "Experience Metric"),
+    Metric("exm_arr", "ARR", "", "high", "Experience Metric"),
+    *(Metric(f"exm_arcr_{mode}", f"ARCR, {mode}", "", "high", "Experience Metric") for mode in EXM_MODES),
+    Metric("exm_action_arr", "ARR, per action", "", "high", "Experience Metric"),
+    Metric("exm_action_arcr_strict", "ARCR, strict, per action", "", "high", "Experience Metric"),
 )
 """In the order of the scorecard."""
 _EXPERIENCE = [metric.name for metric in RUN_METRICS if metric.section == "Experience Metric"]

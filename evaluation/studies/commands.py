@@ -164,10 +164,7 @@ def _study(arguments: argparse.Namespace) -> int:
         runs = search_plan(study).trials * len(plan.every_seed()) * max(plan.copies, 1)
     alone = plan.report == "pareto" and arguments.scheduler is None and arguments.workers in (None, 1)
     log = RunLog(_folder(arguments, study.name, "runs.jsonl"))
-    with (
-        _Progress(runs, log.path) as progress,
-        Executor(arguments.workers, arguments.scheduler) as executor,
-    ):
+    with _Progress(runs, log.path) as progress, Executor(arguments.workers, arguments.scheduler) as executor:
         if searching:
             records = search(study, log, executor, progress)
         elif alone:
@@ -211,13 +208,7 @@ def _growth(arguments: argparse.Namespace) -> int:
 
 
 def _cells(arguments: argparse.Namespace) -> int:
-    from evaluation.studies.cell_study import (
-        FOLDER,
-        cell_study,
-        render_cells,
-        run_cell_study,
-        save_cells,
-    )
+    from evaluation.studies.cell_study import FOLDER, cell_study, render_cells, run_cell_study, save_cells
     from evaluation.studies.executor import Executor
 
     study = cell_study(find_config(arguments.config), arguments.set)
