@@ -23,18 +23,13 @@ KEYS = ("step", "match_step", "verdict")
 
 
 class ClosureTable(NamedTuple):
-    """The closures of a run, n of them, in the order of the file.
-
-    Attributes:
-        steps: [n, 2] the earlier and the later step that a closure joins, counted from the first step of
-            this run: negative in the run that this one continues.
-        verdicts: [n] `accepted`, or why it is no closure of the map.
-        evidence: the other columns, [n] each, by name.
-    """
+    """The closures of a run, n of them, in the order of the file."""
 
     steps: np.ndarray
-    verdicts: list[str]
-    evidence: Mapping[str, np.ndarray]
+    """[n, 2] the earlier and the later step that a closure joins, counted from the first step of this run:
+    negative in the run that this one continues."""
+    verdicts: list[str]  # [n] `accepted`, or why it is no closure of the map
+    evidence: Mapping[str, np.ndarray]  # the other columns, [n] each, by name
 
     def accepted(self) -> np.ndarray:
         """[n] bool, which are closures of the map."""

@@ -58,16 +58,11 @@ _HEAD = re.compile(rb"P5(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^
 
 
 class Nav2Map(NamedTuple):
-    """A map as map_server publishes it.
+    """A map as map_server publishes it."""
 
-    Attributes:
-        cell: [H, W] int, occupancy in 0..100 or -1 for unknown; row j counts y upwards.
-        origin: [3] x, y (m) and yaw (rad) of the lower left corner. resolution: cell side length, m.
-    """
-
-    cell: np.ndarray
-    origin: np.ndarray
-    resolution: float
+    cell: np.ndarray  # [H, W] int, occupancy in 0..100 or -1 for unknown; row j counts y upwards
+    origin: np.ndarray  # [3] x, y (m) and yaw (rad) of the lower left corner
+    resolution: float  # cell side length, m
 
 
 def write_nav2(folder: Path, grid: OccupancyGrid, name: str = "map") -> None:

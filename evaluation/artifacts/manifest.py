@@ -16,26 +16,19 @@ RUNNING = "running"
 
 
 class Manifest(NamedTuple):
-    """The manifest of a run.
-
-    Attributes:
-        status: `running`, `complete` or `interrupted`; of a live session that ended before its map was
-            finished, the outcome from its report. source: name of the recording or simulation.
-        total: final number of steps, if known. seed: of the session, if known.
-        versions: of the program, its libraries and Python. continued: whether it went on from a map.
-        killed: it has not ended, and no process writes it. digest: sha256 of its recording or simulation,
-            '' of a live session. warnings: about the input, a sentence each.
-    """
+    """The manifest of a run."""
 
     status: str = RUNNING
-    source: str = ""
-    total: int | None = None
-    seed: int | None = None
-    versions: Mapping[str, str] = {}
-    continued: bool = False
-    killed: bool = False
-    digest: str = ""
-    warnings: tuple[str, ...] = ()
+    """`running`, `complete` or `interrupted`; of a live session that ended before its map was finished, the
+    outcome from its report."""
+    source: str = ""  # name of the recording or simulation
+    total: int | None = None  # final number of steps, if known
+    seed: int | None = None  # of the session, if known
+    versions: Mapping[str, str] = {}  # of the program, its libraries and Python
+    continued: bool = False  # whether it went on from a map
+    killed: bool = False  # it has not ended, and no process writes it
+    digest: str = ""  # sha256 of its recording or simulation, '' of a live session
+    warnings: tuple[str, ...] = ()  # about the input, a sentence each
 
 
 def read_manifest(directory: Path) -> Manifest:

@@ -17,15 +17,10 @@ NAME = "closure_views.npz"
 
 
 class ClosureViews(NamedTuple):
-    """Views of n steps.
+    """Views of n steps."""
 
-    Attributes:
-        step: [n] increasing, counted from the first step of this run.
-        view: [n, R, C] uint8, brightness.
-    """
-
-    step: np.ndarray
-    view: np.ndarray
+    step: np.ndarray  # [n] increasing, counted from the first step of this run
+    view: np.ndarray  # [n, R, C] uint8, brightness
 
 
 def eight_bit(view: np.ndarray) -> np.ndarray:
@@ -56,20 +51,13 @@ _WHITE = 255
 
 
 class WhiskerViews(NamedTuple):
-    """Whisker images of N steps and a head with R rings of C whiskers.
+    """Whisker images of N steps and a head with R rings of C whiskers."""
 
-    Attributes:
-        view: [N, R, C] pixel values in 0..1, 0 without contact.
-        alive: [N, R, C] bool, the whisker has a signal.
-        azimuth: [C] direction of the whiskers of each column, rad counter-clockwise from ahead.
-        length: [R] length of the whiskers of each ring, m. tallest: obstacle height of pixel value 1, m.
-    """
-
-    view: np.ndarray
-    alive: np.ndarray
-    azimuth: np.ndarray
-    length: np.ndarray
-    tallest: float
+    view: np.ndarray  # [N, R, C] pixel values in 0..1, 0 without contact
+    alive: np.ndarray  # [N, R, C] bool, the whisker has a signal
+    azimuth: np.ndarray  # [C] direction of the whiskers of each column, rad counter-clockwise from ahead
+    length: np.ndarray  # [R] length of the whiskers of each ring, m
+    tallest: float  # obstacle height of pixel value 1, m
 
 
 def write_whisker_views(path: str | Path, images: WhiskerViews) -> None:

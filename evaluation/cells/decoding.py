@@ -26,19 +26,14 @@ WINDOW = 0.5
 
 
 class Decoding(NamedTuple):
-    """Decoded positions in M windows.
+    """Decoded positions in M windows."""
 
-    Attributes:
-        time: [M] s, middle of the window. truth, decoded: [M, 2] m. error: [M] distance between them, m.
-        median: of the error, m. control: [shifts] median errors of circularly shifted activity, m.
-    """
-
-    time: np.ndarray
-    truth: np.ndarray
-    decoded: np.ndarray
-    error: np.ndarray
-    median: float
-    control: np.ndarray
+    time: np.ndarray  # [M] s, middle of the window
+    truth: np.ndarray  # [M, 2] m
+    decoded: np.ndarray  # [M, 2] m
+    error: np.ndarray  # [M] distance between them, m
+    median: float  # of the error, m
+    control: np.ndarray  # [shifts] median errors of circularly shifted activity, m
 
 
 def decode_positions(

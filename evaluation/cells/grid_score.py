@@ -214,14 +214,10 @@ _FLAT = 1e-12
 
 
 class Lattice(NamedTuple):
-    """The symmetry of a lattice.
+    """The symmetry of a lattice."""
 
-    Attributes:
-        onto: angles that map it onto itself, degrees. between: angles that move its points farthest, degrees.
-    """
-
-    onto: tuple[float, ...]
-    between: tuple[float, ...]
+    onto: tuple[float, ...]  # angles that map it onto itself, degrees
+    between: tuple[float, ...]  # angles that move its points farthest, degrees
 
 
 HEXAGONAL = Lattice((60.0, 120.0), (30.0, 90.0, 150.0))
@@ -229,20 +225,14 @@ SQUARE = Lattice((90.0,), (45.0, 135.0))
 
 
 class _Annuli(NamedTuple):
-    """Bins of half an autocorrelogram in the order of their radius; it is symmetric, so half suffices.
+    """Bins of half an autocorrelogram in the order of their radius; it is symmetric, so half suffices."""
 
-    Attributes:
-        half: [P] flat indices. rotation: [A * P, h * w] bilinear rotation by each angle.
-        starts: [S] where the distinct sums start. below, within: [R + 1] how many of these sums have a radius
-            < r, <= r, for r = 0 .. R bins. bins: [S + 1] in the first sums.
-    """
-
-    half: np.ndarray
-    rotation: sparse.csr_array
-    starts: np.ndarray
-    below: np.ndarray
-    within: np.ndarray
-    bins: np.ndarray
+    half: np.ndarray  # [P] flat indices
+    rotation: sparse.csr_array  # [A * P, h * w] bilinear rotation by each angle
+    starts: np.ndarray  # [S] where the distinct sums start
+    below: np.ndarray  # [R + 1] how many of these sums have a radius < r, for r = 0 .. R bins
+    within: np.ndarray  # [R + 1] how many have a radius <= r
+    bins: np.ndarray  # [S + 1] in the first sums
 
 
 def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -> np.ndarray:

@@ -82,19 +82,14 @@ def smooth_plane(values: np.ndarray, sigma: float) -> np.ndarray:
 
 
 class BoxSamples(NamedTuple):
-    """The M samples of a path whose pose is known and inside the box.
+    """The M samples of a path whose pose is known and inside the box."""
 
-    Attributes:
-        time, seconds: [M] s. position: [M, 2] m. place: [M] int bin in the flattened [H, W]. heading: [M] int
-            bin. activity: [M, C].
-    """
-
-    time: np.ndarray
-    seconds: np.ndarray
-    position: np.ndarray
-    place: np.ndarray
-    heading: np.ndarray
-    activity: np.ndarray
+    time: np.ndarray  # [M] s
+    seconds: np.ndarray  # [M] s
+    position: np.ndarray  # [M, 2] m
+    place: np.ndarray  # [M] int bin in the flattened [H, W]
+    heading: np.ndarray  # [M] int bin
+    activity: np.ndarray  # [M, C]
 
 
 def bin_activity(

@@ -33,16 +33,11 @@ _FEWEST = 19
 
 
 class PathBins(NamedTuple):
-    """The bin of each sample of a path: of place, of heading or of any other variable.
+    """The bin of each sample of a path: of place, of heading or of any other variable."""
 
-    Attributes:
-        flat: [T] int flat index into bins of `shape`, -1 for a sample that does not count. shape: of the
-            bins, (H, W) or (B,). seconds: [T] s that each sample stands for.
-    """
-
-    flat: np.ndarray
-    shape: tuple[int, ...]
-    seconds: np.ndarray
+    flat: np.ndarray  # [T] int flat index into bins of `shape`, -1 for a sample that does not count
+    shape: tuple[int, ...]  # of the bins, (H, W) or (B,)
+    seconds: np.ndarray  # [T] s that each sample stands for
 
 
 class ShuffledScores(NamedTuple):
@@ -83,20 +78,14 @@ class ShuffledScores(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """How often shuffled cells exceed the 95th percentile of their own shuffles.
+    """How often shuffled cells exceed the 95th percentile of their own shuffles."""
 
-    Attributes:
-        cells: that have a score and a percentile. share: of them above the percentile. tied: share of them
-            at it, as happens to a score of few values; it is missing in `share`.
-        low, high: binomial 95 % band of the share round 5 %. shuffled_mean: mean score of all shuffles.
-    """
-
-    cells: int
-    share: float
-    tied: float
-    low: float
-    high: float
-    shuffled_mean: float
+    cells: int  # that have a score and a percentile
+    share: float  # of them above the percentile
+    tied: float  # share of them at it, as happens to a score of few values; it is missing in `share`
+    low: float  # of the binomial 95 % band of the share round 5 %
+    high: float  # of the same band
+    shuffled_mean: float  # mean score of all shuffles
 
 
 def shuffled_scores(

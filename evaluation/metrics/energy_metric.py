@@ -23,14 +23,10 @@ _RELATIONS = {name: () for name in ("t1", "t2", "x", "y", "z", "roll", "pitch", 
 
 
 class Energy(NamedTuple):
-    """The two parts of the energy, means over `pairs` pairs (NaN without pairs).
+    """The two parts of the energy, means over `pairs` pairs (NaN without pairs)."""
 
-    Attributes:
-        trans2: mean squared translation error, m^2. rot2: mean squared rotation error, rad^2.
-    """
-
-    trans2: float
-    rot2: float
+    trans2: float  # mean squared translation error, m^2
+    rot2: float  # mean squared rotation error, rad^2
     pairs: int
 
     @property
@@ -40,15 +36,11 @@ class Energy(NamedTuple):
 
 
 class Relations(NamedTuple):
-    """True relative motions between two times of a recording, as published with the benchmark.
+    """True relative motions between two times of a recording, as published with the benchmark."""
 
-    Attributes:
-        start: [P] s. end: [P] s. motion: [P, 3] pose at `end` relative to that at `start`, m, m, rad.
-    """
-
-    start: np.ndarray
-    end: np.ndarray
-    motion: np.ndarray
+    start: np.ndarray  # [P] s
+    end: np.ndarray  # [P] s
+    motion: np.ndarray  # [P, 3] pose at `end` relative to that at `start`, m, m, rad
 
 
 def successive_pairs(count: int, step: int = 1) -> np.ndarray:

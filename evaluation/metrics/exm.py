@@ -104,30 +104,18 @@ _OfEntries = Callable[[np.ndarray], np.ndarray]
 
 
 class ExperienceMetric(NamedTuple):
-    """ARR and ARCR of one run with their counts.
+    """ARR and ARCR of one run with their counts."""
 
-    Attributes:
-        arr: re-localisations / entries after the base set; NaN without entries.
-        arcr: correct re-localisations / re-localisations; NaN without re-localisations.
-        entries: entries after the base set. relocalisations: eta. correct: eta_c.
-        base: entries in the base set, in the log used.
-        mode, log: as in `ExmConfig`. note: reason for NaN, or a warning ('' for none).
-        counted: [N] bool, the entry is a re-localisation. right: [N] bool, a correct one.
-        near: [N] bool, true and perceived pose are within the thresholds (line 24; where `counted`).
-    """
-
-    arr: float
-    arcr: float
-    entries: int
-    relocalisations: int
-    correct: int
-    base: int
-    mode: ExmMode
-    log: str
-    note: str
-    counted: np.ndarray
-    right: np.ndarray
-    near: np.ndarray
+    arr: float  # re-localisations / entries after the base set; NaN without entries
+    arcr: float  # correct re-localisations / re-localisations; NaN without re-localisations
+    entries: int  # after the base set
+    relocalisations: int  # eta
+    correct: int  # eta_c
+    base: int  # entries in the base set, in the log used
+    note: str  # reason for NaN, or a warning ('' for none)
+    counted: np.ndarray  # [N] bool, the entry is a re-localisation
+    right: np.ndarray  # [N] bool, a correct one
+    near: np.ndarray  # [N] bool, true and perceived pose are within the thresholds (line 24; where `counted`)
 
     @property
     def arcr_chain_free(self) -> float:
@@ -177,7 +165,7 @@ def experience_metric(
     note = "; ".join(notes + ([] if eta else [NO_RELOCALISATION]))
     arr, arcr = eta / entries if entries else np.nan, eta_c / eta if eta else np.nan
     counts = entries, eta, eta_c, base
-    return ExperienceMetric(arr, arcr, *counts, config.mode, config.log, note, counted, right, near)
+    return ExperienceMetric(arr, arcr, *counts, note, counted, right, near)
 
 
 def relocalisations(experience: np.ndarray, base: int) -> np.ndarray:

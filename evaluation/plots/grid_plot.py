@@ -24,19 +24,15 @@ _HEAD, _GAP, _BOTTOM = 0.48, 0.42, 1.0  # inches above a small map, between two,
 
 
 class GridPanel(NamedTuple):
-    """A map to draw.
+    """A map to draw."""
 
-    Attributes:
-        name: title. line: subtitle with its metrics. grid: the map. segments: [S, 4] true walls, m.
-        paths: of the run, [T, 2] or [T, 3] each, m: the true path, which may have NaN rows, online poses of
-            the filter, and dead reckoning.
-    """
-
-    name: str
-    line: str
+    name: str  # title
+    line: str  # subtitle with its metrics
     grid: OccupancyGrid
-    segments: np.ndarray = NO_SEGMENTS
+    segments: np.ndarray = NO_SEGMENTS  # [S, 4] true walls, m
     paths: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    """Of a run, [T, 2] or [T, 3] each, m: the true path, which may have NaN rows, online poses of the filter,
+    and dead reckoning."""
 
 
 def draw_grid(panel: GridPanel) -> style.Figure:

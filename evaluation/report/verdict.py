@@ -20,15 +20,11 @@ CAUTION = 1 - DOUBTED
 
 
 class Verdict(NamedTuple):
-    """Whether to believe a map.
-
-    Attributes:
-        level: its kind. headline: a few words. reason: a sentence.
-    """
+    """Whether to believe a map."""
 
     level: Literal["believed", "uncertain", "doubted", "unjudged"]
-    headline: str
-    reason: str
+    headline: str  # a few words
+    reason: str  # a sentence
 
 
 def judge_map(doubt: float, unjudged: str = NOT_JUDGED) -> Verdict:
