@@ -57,8 +57,8 @@ class Metric(NamedTuple):
     Attributes:
         name: key in `scorecard.json`. label: in words. unit: SI, `deg`, or ''.
         direction: of better values. section: heading in the table.
-        compute: the finding from a `RunData`; None without the ground truth that it needs, and of a metric
-            whose finding is made with those of others and found by its name.
+        compute: the finding from a `RunData`; None without the ground truth that it needs, and of quantities
+            that are made otherwise.
     """
 
     name: str

@@ -115,10 +115,8 @@ def grid_error(
     )
 
 
-def pool_errors(errors: Sequence[GridError]) -> GridError:
+def _pool_errors(errors: Sequence[GridError]) -> GridError:
     """The mean of the errors of several trials, under the same convention."""
-    if len({error.convention for error in errors}) != 1:
-        raise ValueError("no errors, or errors under different conventions; expected one convention")
     every = [error.error for error in errors]
     error, best = _mean(every), _mean([each.best for each in errors])
     return GridError(
@@ -278,7 +276,7 @@ def pool_grids(scores: Sequence[GridScore], name: str) -> GridScore:
     return GridScore(
         name=name,
         trials=len(scores),
-        errors=tuple(pool_errors(each) for each in zip(*(score.errors for score in scores), strict=True)),
+        errors=tuple(_pool_errors(each) for each in zip(*(score.errors for score in scores), strict=True)),
         quantities={
             metric.name: Quantity.pool([score.quantities[metric.name] for score in scores])
             for metric in GRID_METRICS

@@ -21,7 +21,7 @@ from evaluation.metrics.energy_metric import (
     successive_pairs,
 )
 from evaluation.metrics.exm import EXM_MODES, ExmConfig, base_end, change_rows, experience_metric
-from evaluation.metrics.metric import Finding, Metric, Quantity
+from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.trajectory import (
     align,
@@ -101,7 +101,7 @@ def arrange_pieces(run: RunArrays) -> RunArrays:
     return run._replace(final=final, online=online, nodes=nodes, node_piece=of_node)
 
 
-def tie_jump(poses: np.ndarray, odometry: np.ndarray) -> tuple[int, float] | None:
+def _tie_jump(poses: np.ndarray, odometry: np.ndarray) -> tuple[int, float] | None:
     """The step at which online poses jump farther than a correction within a piece could move them, and how
     far, m; None without one. A piece lies far from all others until it is tied to them.
 
@@ -134,6 +134,10 @@ class RunData(NamedTuple):
     findings: dict[str, Finding]  # of `RUN_METRICS` by name, without those that need a missing truth
 
 
+def _metric(name: str, label: str, unit: str, direction: Direction, section: str) -> Metric:
+    return Metric(name, label, unit, direction, section, lambda data: data.findings.get(name))
+
+
 _PAIRS = {
     "change": "successive experience changes",
     "consecutive": "consecutive steps",
@@ -145,35 +149,35 @@ PIECES = "Pieces"
 """Heading of the metrics of a map in several pieces."""
 _PARTS = (("", "", "m2+rad2"), ("_trans2", ", trans", "m2"), ("_rot2", ", rot", "rad2"))
 RUN_METRICS: tuple[Metric, ...] = (
-    Metric("steps", "steps", "", None, "Extent"),
-    Metric("duration", "duration", "s", None, "Extent"),
-    Metric("path", "length of the true path", "m", None, "Extent"),
-    Metric("experiences", "experiences", "", None, "Extent"),
-    Metric("links", "links", "", None, "Extent"),
-    Metric("map_doubt", "map worse than odometry, probability", "", None, "Health"),
-    Metric("pieces", "pieces that nothing joins", "", None, PIECES),
-    Metric("unjoined_share", "share of steps outside the largest piece", "", "low", PIECES),
-    Metric("energy_within_pieces", "Energy Metric within pieces", "m2+rad2", "low", PIECES),
-    Metric("ate_within_pieces", "ATE within pieces", "m", "low", PIECES),
-    Metric("ate_final", "ATE, final", "m", "low", "Trajectory"),
-    Metric("ate_online", "ATE, online", "m", "low", "Trajectory"),
-    Metric("anytime_median", "online error, median", "m", "low", "Trajectory"),
-    Metric("anytime_late", "online error, RMS of the second half", "m", "low", "Trajectory"),
-    Metric("anytime_jump", "online error, largest jump", "m", "low", "Trajectory"),
-    Metric("rpe_translation", "RPE over one step, translation", "m", "low", "Trajectory"),
-    Metric("rpe_rotation_deg", "RPE over one step, rotation", "deg", "low", "Trajectory"),
-    Metric("relations_translation", "relations file, translation", "m", "low", "Trajectory"),
-    Metric("relations_rotation_deg", "relations file, rotation", "deg", "low", "Trajectory"),
+    _metric("steps", "steps", "", None, "Extent"),
+    _metric("duration", "duration", "s", None, "Extent"),
+    _metric("path", "length of the true path", "m", None, "Extent"),
+    _metric("experiences", "experiences", "", None, "Extent"),
+    _metric("links", "links", "", None, "Extent"),
+    _metric("map_doubt", "map worse than odometry, probability", "", None, "Health"),
+    _metric("pieces", "pieces that nothing joins", "", None, PIECES),
+    _metric("unjoined_share", "share of steps outside the largest piece", "", "low", PIECES),
+    _metric("energy_within_pieces", "Energy Metric within pieces", "m2+rad2", "low", PIECES),
+    _metric("ate_within_pieces", "ATE within pieces", "m", "low", PIECES),
+    _metric("ate_final", "ATE, final", "m", "low", "Trajectory"),
+    _metric("ate_online", "ATE, online", "m", "low", "Trajectory"),
+    _metric("anytime_median", "online error, median", "m", "low", "Trajectory"),
+    _metric("anytime_late", "online error, RMS of the second half", "m", "low", "Trajectory"),
+    _metric("anytime_jump", "online error, largest jump", "m", "low", "Trajectory"),
+    _metric("rpe_translation", "RPE over one step, translation", "m", "low", "Trajectory"),
+    _metric("rpe_rotation_deg", "RPE over one step, rotation", "deg", "low", "Trajectory"),
+    _metric("relations_translation", "relations file, translation", "m", "low", "Trajectory"),
+    _metric("relations_rotation_deg", "relations file, rotation", "deg", "low", "Trajectory"),
     *(
-        Metric(f"energy_{pairs}{suffix}", label + part, unit, "low", "Energy Metric")
+        _metric(f"energy_{pairs}{suffix}", label + part, unit, "low", "Energy Metric")
         for pairs, label in _PAIRS.items()
         for suffix, part, unit in _PARTS
     ),
-    Metric("exm_base", "base set", "entries", None, "Experience Metric"),
-    Metric("exm_arr", "ARR", "", "high", "Experience Metric"),
-    *(Metric(f"exm_arcr_{mode}", f"ARCR, {mode}", "", "high", "Experience Metric") for mode in EXM_MODES),
-    Metric("exm_action_arr", "ARR, per action", "", "high", "Experience Metric"),
-    Metric("exm_action_arcr_strict", "ARCR, strict, per action", "", "high", "Experience Metric"),
+    _metric("exm_base", "base set", "entries", None, "Experience Metric"),
+    _metric("exm_arr", "ARR", "", "high", "Experience Metric"),
+    *(_metric(f"exm_arcr_{mode}", f"ARCR, {mode}", "", "high", "Experience Metric") for mode in EXM_MODES),
+    _metric("exm_action_arr", "ARR, per action", "", "high", "Experience Metric"),
+    _metric("exm_action_arcr_strict", "ARCR, strict, per action", "", "high", "Experience Metric"),
 )
 """In the order of the scorecard."""
 _EXPERIENCE = [metric.name for metric in RUN_METRICS if metric.section == "Experience Metric"]
@@ -229,7 +233,7 @@ def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[s
     known, (translation, rotation) = len(run.online_error) > 0, rpe(final, truth)
     errors = summarize_errors(run.online_error if known else online_errors(online, truth))
     note, tied = "in the map of that time" if known else "of the online poses", ""
-    if jump := tie_jump(run.online, run.odometry):  # online poses were in a piece of their own at first
+    if jump := _tie_jump(run.online, run.odometry):  # online poses were in a piece of their own at first
         at, distance = run.time[jump[0]], jump[1]
         tied = f"with a jump of {distance:.1f} m at t = {at:.1f} s, as where a new piece is tied"
     unfinished = np.array_equal(run.final, run.online)

@@ -112,8 +112,7 @@ def score_run(
     for metric in (*RUN_METRICS, *metrics):
         unused = metric.section == PIECES and not run.has_pieces
         if not unused and (relations is not None or not metric.name.startswith("relations_")):
-            found = metric.compute(data) or data.findings.get(metric.name, MISSING_TRUTH)
-            quantities[metric.name] = metric.quantity(found)
+            quantities[metric.name] = metric.quantity(metric.compute(data) or MISSING_TRUTH)
     return Scorecard(name=name, exm=exm, quantities=quantities, health=health)
 
 

@@ -245,7 +245,10 @@ def view_records(views: ClosureViews | None) -> dict[str, Any] | None:
     image, shape = views.view, views.view.shape[1:]
     while image.size > VIEW_BYTES and max(image.shape[1:]) > 1:
         image = halve(image)
-    gain = display_gain(image)
+    # The factor, at least 1, that makes the brightest hundredth of the non-zero pixels white. Views of a room
+    # that is small beside the range of the sensor would be black otherwise.
+    seen = image[image > 0]
+    gain = max(255 / float(np.quantile(seen, 0.99)), 1.0) if seen.size else 1.0
     image = np.minimum(np.ceil(image * gain), 255).astype(np.uint8)
     return {
         "steps": views.step.tolist(),
@@ -255,15 +258,6 @@ def view_records(views: ClosureViews | None) -> dict[str, Any] | None:
         "shape": list(shape),
         "pixels": b64encode(np.ascontiguousarray(image).tobytes()).decode(),
     }
-
-
-def display_gain(image: np.ndarray) -> float:
-    """The factor, at least 1, that makes the brightest hundredth of the non-zero pixels [n, R, C] white.
-
-    Views of a room that is small beside the range of the sensor would be black otherwise.
-    """
-    seen = image[image > 0]
-    return max(255 / float(np.quantile(seen, 0.99)), 1.0) if seen.size else 1.0
 
 
 def halve(image: np.ndarray) -> np.ndarray:

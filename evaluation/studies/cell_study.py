@@ -37,7 +37,7 @@ from tactile.base.random_streams import stream
 from tactile.base.settings import Settings
 
 _Scores = dict[str, np.ndarray]
-"""See `score_sets`."""
+"""See `_score_sets`."""
 
 
 class _Sums:
@@ -101,7 +101,7 @@ class _Sums:
         return np.stack([np.hypot(x, y), np.abs(heading)], axis=-1)
 
 
-def score_sets(study: StudyCourse, sets: CellSets, dtype: np.dtype) -> _Scores:
+def _score_sets(study: StudyCourse, sets: CellSets, dtype: np.dtype) -> _Scores:
     """Simulates B networks over the course in the given precision and scores them.
 
     Memory does not depend on the length of the course, apart from the course itself. Drift is the packet,
@@ -145,7 +145,7 @@ Width = Annotated[
 ]
 
 
-class CellPlan(Settings):
+class _CellPlan(Settings):
     """The settings of a study of many networks. Each range is [low, high]; equal ends fix a parameter."""
 
     sets: PositiveInt = 1000
@@ -180,14 +180,14 @@ class CellPlan(Settings):
 
 
 PARAMETERS = ("excite_sigma", "inhibit_sigma", "global_inhibition", "energy", "speed_noise", "heading_noise")
-"""Columns of parameter sets, and the ranges of a `CellPlan`."""
+"""Columns of parameter sets, and the ranges of a `_CellPlan`."""
 
 
 class _CellStudy(NamedTuple):
     """A checked study. parameters: [sets, 6] in the order of `PARAMETERS`."""
 
     name: str
-    plan: CellPlan
+    plan: _CellPlan
     course: StudyCourse
     parameters: np.ndarray
 
@@ -213,22 +213,18 @@ def cell_study(path: Path, overrides: Sequence[str] = ()) -> _CellStudy:
     """The study of a configuration file; reads its session.
 
     Args:
-        overrides: each `a.b=value`: a key of `CellPlan` where it is one, else of the configuration.
+        overrides: each `a.b=value`: a key of `_CellPlan` where it is one, else of the configuration.
 
     Raises:
         InputError: a setting is invalid, or see `read_course`.
     """
-    plan, others = preset_settings(CellPlan, "cells", overrides)
+    plan, others = preset_settings(_CellPlan, "cells", overrides)
     course = read_course(load_config(path, others), plan.steps, plan.views, plan.bins, plan.chosen, plan.seed)
-    return _CellStudy(f"{path.stem}-cells", plan, course, parameter_sets(plan))
-
-
-def parameter_sets(plan: CellPlan) -> np.ndarray:
-    """[sets, 6] parameters in the order of `PARAMETERS`: points of a scrambled Halton sequence (Owen 2017,
-    arXiv:1706.02808)."""
+    # Points of a scrambled Halton sequence (Owen 2017, arXiv:1706.02808).
     ends = np.array([getattr(plan, name) for name in PARAMETERS])
     share = qmc.Halton(len(PARAMETERS), rng=stream(plan.seed, "cells.sets")).random(plan.sets)
-    return ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    parameters = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    return _CellStudy(f"{path.stem}-cells", plan, course, parameters)
 
 
 def run_cell_study(
@@ -277,7 +273,7 @@ def score_task(task: _Chunk) -> _Scores:
     rows = np.arange(task.size).clip(max=len(task.parameters) - 1)
     columns = dict(zip(PARAMETERS, task.parameters[rows].T, strict=True))
     noise = columns.pop("speed_noise"), columns.pop("heading_noise")
-    scores = score_sets(task.course, CellSets(Network(**columns), *noise), np.dtype(task.precision))
+    scores = _score_sets(task.course, CellSets(Network(**columns), *noise), np.dtype(task.precision))
     return {name: column[: len(task.parameters)] for name, column in scores.items()}
 
 

@@ -73,7 +73,7 @@ Ground = Literal["known ground", "new ground"]
 Length = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
-class GrowthPlan(Settings):
+class _GrowthPlan(Settings):
     """The settings of a growth study."""
 
     first: PositiveInt = 400  # least length to measure at, steps; each further one is twice as long
@@ -91,34 +91,34 @@ class GrowthPlan(Settings):
         return [*found, most] if most else []
 
 
-class GrowthTask(NamedTuple):
+class _GrowthTask(NamedTuple):
     """One session of a growth study."""
 
     ground: Ground
     config: RunConfig  # a simulation of whiskers is at least as long as the greatest length
     lengths: list[int]  # to measure at, increasing, steps
-    window: int = 0  # see `GrowthPlan`
+    window: int = 0  # see `_GrowthPlan`
 
 
-def growth_study(path: Path, overrides: Sequence[str] = ()) -> tuple[str, list[GrowthTask]]:
+def growth_study(path: Path, overrides: Sequence[str] = ()) -> tuple[str, list[_GrowthTask]]:
     """Name and sessions of the growth study of a configuration file.
 
     Args:
-        overrides: each `a.b=value`: a key of `GrowthPlan` where it is one, else of the configuration.
+        overrides: each `a.b=value`: a key of `_GrowthPlan` where it is one, else of the configuration.
 
     Raises:
         InputError: the configuration is invalid, or the ground is too small.
     """
-    plan, others = preset_settings(GrowthPlan, "growth", overrides)
+    plan, others = preset_settings(_GrowthPlan, "growth", overrides)
     document = override(load(path), others)
     config = validate(document, RunConfig).with_absolute_paths(path.parent.resolve())
     whiskers = config.simulation is not None
     tasks = []
     if lengths := plan.lengths("known ground"):
         known = _with_laps(config, lengths[-1]) if whiskers else config
-        tasks.append(GrowthTask("known ground", known, lengths, plan.window))
+        tasks.append(_GrowthTask("known ground", known, lengths, plan.window))
     if whiskers and (lengths := plan.lengths("new ground")):
-        tasks.append(GrowthTask("new ground", with_new_ground(config, lengths[-1]), lengths, plan.window))
+        tasks.append(_GrowthTask("new ground", with_new_ground(config, lengths[-1]), lengths, plan.window))
     if not tasks:
         raise InputError("--preset growth", "no session", "known_ground or new_ground above 0 steps")
     return f"{path.stem}-growth", tasks
@@ -184,7 +184,7 @@ TIMES = ("mean", "process_mean", "median", "p99", "largest", "longest")
 
 class _GrowthRow(Settings):
     """A session at one length. Times are of the steps since the length before, or of the window of
-    `GrowthPlan`, without those that compiled code; None if all did. Errors are of all steps so far."""
+    `_GrowthPlan`, without those that compiled code; None if all did. Errors are of all steps so far."""
 
     ground: Ground
     steps: int  # length of the session
@@ -252,7 +252,7 @@ class _StepClock:
         self._compiling, self._others, self._began = 0.0, 0.0, _read_clocks()
 
 
-def measure_growth(task: GrowthTask, done: Callable[[], object] = lambda: None) -> Iterator[_GrowthRow]:
+def measure_growth(task: _GrowthTask, done: Callable[[], object] = lambda: None) -> Iterator[_GrowthRow]:
     """Plays the session once, to its greatest length; yields a row at each length.
 
     Args:
@@ -323,7 +323,7 @@ optimisation if the session ended here. final, closures, false: of the map after
 than 0.1 m apart."""
 
 
-def run_growth(tasks: Sequence[GrowthTask], folder: Path) -> None:
+def run_growth(tasks: Sequence[_GrowthTask], folder: Path) -> None:
     """Runs sessions one after another; each row is in `folder/FILE` as soon as it is measured.
 
     Raises:
@@ -389,7 +389,7 @@ def save_growth(name: str, rows: Sequence[_GrowthRow], folder: Path) -> list[Pat
     return save_files(folder, {"table.csv": csv_text(lines), "table.md": table, "growth.png": figure})
 
 
-def _append_rows(path: Path, task: GrowthTask) -> str | None:
+def _append_rows(path: Path, task: _GrowthTask) -> str | None:
     """Measures a session, with a progress bar; appends its rows to a file."""
     from tqdm import tqdm
 

@@ -86,7 +86,13 @@ def _add_noise(log: InMemorySource, stream: np.random.Generator) -> InMemorySour
     motion[:, 2] += moving * TURN_NOISE / np.sqrt(apart) * stream.standard_normal(len(motion))
     noise = VIEW_NOISE * stream.standard_normal(log.views.shape)
     views = np.where(log.seen[:, None, None, None], np.clip(log.views + noise, 0, 1), log.views)
-    return replace(log, motion=motion, views=views, label=corrupt_labels(log.label, stream))
+    # Some labels are replaced by new labels, and some by labels of other rows.
+    given = np.flatnonzero(log.label >= 0)
+    label, chance = log.label.copy(), stream.random(len(given))
+    new, wrong = given[chance < NEW_IDS], given[(chance >= NEW_IDS) & (chance < NEW_IDS + WRONG_IDS)]
+    label[wrong] = stream.permutation(label[given])[: len(wrong)]
+    label[new] = label.max(initial=0) + 1 + np.arange(len(new))
+    return replace(log, motion=motion, views=views, label=label)
 
 
 def miscalibrate(log: InMemorySource, seed: int) -> InMemorySource:
@@ -127,16 +133,6 @@ def spoil_labels(log: InMemorySource, seed: int, kind: Literal["lost", "wrong", 
         others = stream.integers(1, len(places), len(chosen))
         label[chosen] = places[(np.searchsorted(places, label[chosen]) + others) % len(places)]
     return replace(log, digest=f"{log.digest}+{kind} {seed}", label=label)
-
-
-def corrupt_labels(label: np.ndarray, stream: np.random.Generator) -> np.ndarray:
-    """Labels [N], some replaced by new labels and some by labels of other rows."""
-    given = np.flatnonzero(label >= 0)
-    label, chance = label.copy(), stream.random(len(given))
-    new, wrong = given[chance < NEW_IDS], given[(chance >= NEW_IDS) & (chance < NEW_IDS + WRONG_IDS)]
-    label[wrong] = stream.permutation(label[given])[: len(wrong)]
-    label[new] = label.max(initial=0) + 1 + np.arange(len(new))
-    return label
 
 
 def _looks(log: InMemorySource) -> np.ndarray:

@@ -114,7 +114,7 @@ class SearchPlan(Settings):
         return given | dict.fromkeys(self.minimise, "low") | dict.fromkeys(self.maximise, "high")
 
 
-class RowPlan(Settings):
+class _RowPlan(Settings):
     """A row: settings by key path, and beside them two keys of its own."""
 
     model_config = ConfigDict(extra="allow")
@@ -134,7 +134,7 @@ class StudyPlan(Settings):
     base: Path  # configuration of all runs: a path, from the folder of the study file, or a packaged name
     set: dict[str, Any] = Field(default_factory=dict)
     """Settings of all runs, by key path. Relative paths in them start at the base, as its own do."""
-    rows: dict[str, RowPlan | None] = Field(default_factory=dict)
+    rows: dict[str, _RowPlan | None] = Field(default_factory=dict)
     """Named sets of settings to compare, by key path. A row may also hold `copies`, in place of the study's,
     and `ablation`: parts of the keyframe map that are off, such as {verify: false}."""
     vary: dict[str, Values] = Field(default_factory=dict)
@@ -170,11 +170,11 @@ class StudyPlan(Settings):
         """The seeds themselves."""
         return tuple(range(self.seeds)) if isinstance(self.seeds, int) else self.seeds
 
-    def every_row(self) -> dict[str, RowPlan]:
+    def every_row(self) -> dict[str, _RowPlan]:
         """The rows; one without a name where the study has none."""
-        return {name: row or RowPlan() for name, row in (self.rows or {"": None}).items()}
+        return {name: row or _RowPlan() for name, row in (self.rows or {"": None}).items()}
 
-    def every_copy(self, row: RowPlan) -> tuple[int, ...]:
+    def every_copy(self, row: _RowPlan) -> tuple[int, ...]:
         """Seeds of a row's perturbed copies; (0,): the session itself."""
         copies = self.copies if row.copies is None else row.copies
         return tuple(range(1, copies + 1)) or (0,)
@@ -267,7 +267,7 @@ def searched_jobs(study: Study, parameters: dict[str, Any]) -> list[Job]:
     settings: list[_Setting] = [
         (key, value, ("tune", "parameters", key)) for key, value in parameters.items()
     ]
-    return list(_runs_of(study, settings, "tune", RowPlan(), parameters))
+    return list(_runs_of(study, settings, "tune", _RowPlan(), parameters))
 
 
 def _jobs(study: Study) -> Iterator[Job]:
@@ -295,7 +295,7 @@ def _jobs(study: Study) -> Iterator[Job]:
 
 
 def _runs_of(
-    study: Study, settings: Sequence[_Setting], name: str, row: RowPlan, varied: dict[str, Any]
+    study: Study, settings: Sequence[_Setting], name: str, row: _RowPlan, varied: dict[str, Any]
 ) -> Iterator[Job]:
     """The study's base with further settings, under every seed and copy."""
     plan, document = study.plan, study.base

@@ -81,7 +81,7 @@ def plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[_Row]:
+def _summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[_Row]:
     """A row for each name and combination, in their order; last that of raw odometry if asked for."""
     groups: dict[str, list[RunRecord]] = {}
     for record in records:
@@ -92,14 +92,7 @@ def summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[_Row
     return rows
 
 
-def default_error(rows: Sequence[_Row]) -> str | None:
-    """The first default error that most rows have in all of their runs; None if no row has any."""
-    whole = [name for row in rows for name, found in row.spreads.items() if None not in found.values]
-    best = max(DEFAULT_ERRORS, key=whole.count)
-    return best if best in whole else None
-
-
-def mark_optimal(rows: Sequence[_Row], objectives: Mapping[str, Direction], statistic: str) -> list[_Row]:
+def _mark_optimal(rows: Sequence[_Row], objectives: Mapping[str, Direction], statistic: str) -> list[_Row]:
     """The rows with `optimal` set by the mean or median of each objective.
 
     Only a row whose runs all have all objectives can be optimal.
@@ -324,13 +317,18 @@ def make_report(
             whether the records are of the trials of a search; then the Pareto-optimal ones are marked.
     """
     kind = "search" if search else plan.report
-    rows = summarise(records, odometry=kind in ("medians", "differences"))
-    error = (error or default_error(rows)) if kind == "pareto" else None
+    rows = _summarise(records, odometry=kind in ("medians", "differences"))
+    if kind != "pareto":
+        error = None
+    elif error is None:  # the first default error that most rows have in all of their runs
+        whole = [name for row in rows for name, found in row.spreads.items() if None not in found.values]
+        first = max(DEFAULT_ERRORS, key=whole.count)
+        error = first if first in whole else None
     columns, remarks = [*COLUMNS.get(kind, ()), *([error] if error else [])], list[str]()
     if error is not None:
-        rows = mark_optimal(rows, {"step_time": "low", error: METRICS[error].direction}, "median")
+        rows = _mark_optimal(rows, {"step_time": "low", error: METRICS[error].direction}, "median")
     if search and plan.tune is not None:
-        columns, rows = [*plan.tune.directions()], mark_optimal(rows, plan.tune.directions(), "mean")
+        columns, rows = [*plan.tune.directions()], _mark_optimal(rows, plan.tune.directions(), "mean")
         best, failed = sum(row.optimal for row in rows), sum(bool(row.failed) for row in rows)
         remarks = [f"{len(rows)} trials, {best} of them Pareto-optimal, {failed} failed"]
     if kind == "differences":

@@ -132,9 +132,8 @@ def test_walls_and_paths_are_drawn_at_their_position():
         "online path, mean error 0.050 m",
         "start",
     ]
-    for line, path in zip(
-        lines.values(), (PATHS.odometry, PATHS.truth, PATHS.estimate, WAY[:1]), strict=True
-    ):
+    true, online, odometry = PATHS
+    for line, path in zip(lines.values(), (odometry, true, online, WAY[:1]), strict=True):
         assert np.allclose(line.get_xydata(), path)
     assert axes.get_xlim() == pytest.approx((-1.25, 1.25))  # dead reckoning may leave, the map stays
     assert lines["truth"].get_color() == YELLOW
@@ -144,9 +143,9 @@ def test_walls_and_paths_are_drawn_at_their_position():
 def test_rows_without_truth_are_not_drawn():
     truth = WAY.copy()
     truth[::2] = np.nan
-    (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=truth))))
+    (axes,) = maps(draw_grid(panel(paths=(truth, *PATHS[1:]))))
     assert [line.get_label() for line in axes.lines][2] == "online path, mean error 0.050 m"
-    (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=np.full_like(WAY, np.nan)))))
+    (axes,) = maps(draw_grid(panel(paths=(np.full_like(WAY, np.nan), *PATHS[1:]))))
     assert [line.get_label() for line in axes.lines] == ["odometry", "truth", "online path"]
 
 

@@ -17,11 +17,8 @@ import pytest
 from evaluation.studies.cell_study import (
     FOLDER,
     PARAMETERS,
-    CellPlan,
     cell_study,
-    parameter_sets,
     run_cell_study,
-    score_sets,
 )
 from evaluation.studies.executor import Executor
 from evaluation.studies.study_course import expected_poses, place_bins, read_course
@@ -76,10 +73,12 @@ def sets_of(arguments: list[str]) -> list[str]:
     return [part for each in arguments for part in ("--set", each)]
 
 
-def test_without_noise_the_packet_follows_the_truth(box):
-    study = cell_study(box(), ["steps=200", "sets=1", "precision=float64"])
-    one = [np.array([value]) for value in (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0)]
-    scores = score_sets(study.course, CellSets(Network(*one[:4]), *one[4:]), np.dtype(float))
+def test_without_noise_the_packet_follows_the_truth(box, tmp_path):
+    values = dict(zip(PARAMETERS, (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0), strict=True))
+    fixed = [f"{name}=[{value}, {value}]" for name, value in values.items()]
+    study = cell_study(box(), ["steps=200", "sets=1", "precision=float64", *fixed])
+    with Executor(1) as executor:
+        scores = run_cell_study(study, tmp_path / "out", executor)
     assert scores["drift"][0] < 0.02  # a fifth of a cell
     assert scores["drift_heading"][0] < 0.05
     assert scores["decoding"][0] <= scores["drift"][0]
@@ -109,11 +108,11 @@ def test_every_position_lies_in_its_bin():
         assert (values <= edges[at + 1] + 1e-12).all()
 
 
-def test_a_larger_study_contains_a_smaller_one():
-    few, many = (parameter_sets(CellPlan(sets=sets)) for sets in (5, 9))
-    assert np.array_equal(many[:5], few)
-    for name, column in zip(PARAMETERS, many.T, strict=True):
-        low, high = getattr(CellPlan(), name)
+def test_a_larger_study_contains_a_smaller_one(box):
+    few, many = (cell_study(box(), [*SMALL, f"sets={sets}"]) for sets in (5, 9))
+    assert np.array_equal(many.parameters[:5], few.parameters)
+    for name, column in zip(PARAMETERS, many.parameters.T, strict=True):
+        low, high = getattr(many.plan, name)
         assert (column >= low).all()
         assert (column <= high).all()
 
