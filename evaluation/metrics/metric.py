@@ -17,16 +17,11 @@ Direction = Literal["low", "high"] | None
 class Quantity(Settings):
     """One measured value."""
 
-    label: str
-    """Name in words."""
-    value: float | int | None
-    """The value; None (null in JSON) if undefined, with the reason in `note`."""
-    unit: str
-    """SI, or degrees as `deg`; '' for a ratio or a count."""
-    odometry: float | int | None = None
-    """The value for odometry, if defined."""
-    note: str = ""
-    """Reason for a missing value, or a remark on the value."""
+    label: str  # name in words
+    value: float | int | None  # the value; None (null in JSON) if undefined, with the reason in `note`
+    unit: str  # SI, or degrees as `deg`; '' for a ratio or a count
+    odometry: float | int | None = None  # the value for odometry, if defined
+    note: str = ""  # reason for a missing value, or a remark on the value
 
     @staticmethod
     def pool(trials: Sequence[Quantity]) -> Quantity:

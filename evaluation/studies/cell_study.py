@@ -151,32 +151,22 @@ class _CellPlan(Settings):
     sets: PositiveInt = 1000
     """Parameter sets: the first of a Halton sequence over the ranges, so that a larger study contains a
     smaller one."""
-    views: bool = False
-    """Whether views of the session inject energy; otherwise path integration alone."""
-    steps: Annotated[int, Field(ge=2)] = 30_000
-    """Most steps of the session to use."""
-    excite_sigma: Width = (0.8, 1.2)
-    """Standard deviation of excitation, cells."""
-    inhibit_sigma: Width = (1.6, 2.4)
-    """Standard deviation of inhibition, cells."""
-    global_inhibition: Range = (0.0, 4e-5)
-    """Activity subtracted from every cell at each sub-step."""
-    energy: Range = (0.5, 2.0)
-    """Factor on the energy that views inject."""
-    speed_noise: Range = (0.0, 0.2)
-    """Standard deviation of each step's motion, as a share of it."""
-    heading_noise: Range = (0.0, 0.1)
-    """Standard deviation of the heading, rad / sqrt(s)."""
+    views: bool = False  # whether views of the session inject energy; otherwise path integration alone
+    steps: Annotated[int, Field(ge=2)] = 30_000  # most steps of the session to use
+    excite_sigma: Width = (0.8, 1.2)  # standard deviation of excitation, cells
+    inhibit_sigma: Width = (1.6, 2.4)  # standard deviation of inhibition, cells
+    global_inhibition: Range = (0.0, 4e-5)  # activity subtracted from every cell at each sub-step
+    energy: Range = (0.5, 2.0)  # factor on the energy that views inject
+    speed_noise: Range = (0.0, 0.2)  # standard deviation of each step's motion, as a share of it
+    heading_noise: Range = (0.0, 0.1)  # standard deviation of the heading, rad / sqrt(s)
     chosen: Annotated[tuple[NonNegativeInt, ...], Field(max_length=CELLS)] = ()
     """Cells whose rate maps are made, indices in the flattened network; none: eight on the way."""
-    bins: Annotated[int, Field(ge=2, le=100)] = 20
-    """Place bins along each side of the square round the path."""
+    bins: Annotated[int, Field(ge=2, le=100)] = 20  # place bins along each side of the square round the path
     chunk: Annotated[int, Field(ge=1, le=1024)] = 32
     """Parameter sets of a job, whose scores are written together."""
     seed: NonNegativeInt = 0
     """Seed of the parameter sets and of the noise, which is the same for all sets apart from its size."""
-    precision: Precision = "float32"
-    """Floating-point type of the networks."""
+    precision: Precision = "float32"  # floating-point type of the networks
 
 
 PARAMETERS = ("excite_sigma", "inhibit_sigma", "global_inhibition", "energy", "speed_noise", "heading_noise")
