@@ -130,9 +130,6 @@ def packet_drift(recording: CellRecording) -> np.ndarray:
     packet's. The torus tells a pose only up to its sides; the error is unwrapped over time: between
     successive known poses it takes the shortest way. An injection that moves the packet by more than half a
     side is thus counted to the nearest copy of its target.
-
-    Raises:
-        InputError: lengths differ or no pose is known.
     """
     moved = truth_in_sheet(recording)
     known = np.flatnonzero(known_poses(moved))
@@ -147,11 +144,7 @@ def packet_drift(recording: CellRecording) -> np.ndarray:
 
 def truth_in_sheet(recording: CellRecording) -> np.ndarray:
     """[T, 3] true poses in the frame of the sheet, m, m, rad, not folded; the first known one is the
-    packet's.
-
-    Raises:
-        InputError: lengths differ or no pose is known.
-    """
+    packet's."""
     check_lengths(recording.time, recording.truth, recording.packet)
     first = np.flatnonzero(known_poses(recording.truth))[0]
     truth = np.asarray(recording.truth, np.float64)

@@ -41,9 +41,6 @@ def autocorrelogram(rates: np.ndarray) -> np.ndarray:
         for 20 x 20 bins); the centre is lag 0. 0 where the common bins are flat in one of the two maps (as in
         opexebo), NaN where the common bins are fewer than a full map has at the largest kept lags, and NaN
         everywhere for a map that is flat or has no visits.
-
-    Raises:
-        InputError: the array is no batch of maps or has no bins.
     """
     rates = np.asarray(rates, float)
     if rates.ndim != 3 or 0 in rates.shape[1:]:
@@ -243,9 +240,6 @@ def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -
 
     Args:
         autocorrelograms: [n, h, w] as from `autocorrelogram`, odd sides. lattice: its symmetry.
-
-    Raises:
-        InputError: the array is no batch of maps with odd sides.
     """
     maps = np.asarray(autocorrelograms, float)
     if maps.ndim != 3 or any(side % 2 == 0 for side in maps.shape[1:]):
@@ -391,9 +385,6 @@ def measure_lattice(
         spacing: [n] m. orientation: [n] rad from the x axis to the next row of peaks anticlockwise, in
             0 .. pi / 3 for a hexagonal and 0 .. pi / 2 for a square lattice. NaN where there are too few
             peaks.
-
-    Raises:
-        InputError: the size of a bin is not positive.
     """
     if not bin_size > 0:
         raise InputError("bin_size", f"{bin_size}", "a length above 0 m")

@@ -24,9 +24,6 @@ def rate_maps(sums: BinnedSums, smoothing: float = 1.5, least_seconds: float = 0
 
     Args:
         smoothing: standard deviation of the Gaussian, bins; 0 for none.
-
-    Raises:
-        InputError: the sums do not fit each other, or no bin was visited long enough.
     """
     if sums.place.shape[1:] != sums.seconds.shape:
         raise InputError(
@@ -39,11 +36,7 @@ def rate_maps(sums: BinnedSums, smoothing: float = 1.5, least_seconds: float = 0
 
 
 def tuning_curves(sums: BinnedSums, least_seconds: float = 0.1) -> np.ndarray:
-    """[cells, B] mean activity at each heading, NaN at headings held for less than `least_seconds`.
-
-    Raises:
-        InputError: the sums do not fit each other, or no heading was held long enough.
-    """
+    """[cells, B] mean activity at each heading, NaN at headings held for less than `least_seconds`."""
     if sums.heading.shape[1:] != sums.heading_seconds.shape:
         found, expected = f"{sums.heading.shape[1]} bins", f"{len(sums.heading_seconds)} of heading_seconds"
         raise InputError("sums.heading", found, expected)
@@ -208,11 +201,7 @@ def arena_edges(truth: np.ndarray, bins: int = 20) -> tuple[np.ndarray, np.ndarr
 
 
 def known_poses(truth: np.ndarray) -> np.ndarray:
-    """[T] bool, the pose [T, 3] is known.
-
-    Raises:
-        InputError: no pose is known.
-    """
+    """[T] bool, the pose [T, 3] is known."""
     known = np.isfinite(truth).all(axis=1)
     if not known.any():
         raise InputError("truth", "no known pose: the path is NaN throughout", "m, m, rad", "record a truth")
@@ -230,9 +219,6 @@ def place_index(truth: np.ndarray, x_edges: np.ndarray, y_edges: np.ndarray) -> 
     """[T] int bin of each pose [T, 3] in the flattened [H, W], -1 outside and where the position is unknown.
 
     The last edges belong to the last bins.
-
-    Raises:
-        InputError: no pose is known.
     """
     known_poses(truth)
     row, column = _interval(truth[:, 1], y_edges), _interval(truth[:, 0], x_edges)
@@ -241,11 +227,7 @@ def place_index(truth: np.ndarray, x_edges: np.ndarray, y_edges: np.ndarray) -> 
 
 def heading_index(truth: np.ndarray, bins: int) -> np.ndarray:
     """[T] int bin of the heading of each pose [T, 3], -1 where it is unknown; bin b is centred on 2 pi b /
-    bins.
-
-    Raises:
-        InputError: no pose is known.
-    """
+    bins."""
     known_poses(truth)
     known = np.isfinite(truth[:, 2])
     return np.where(known, circle_bin(np.where(known, truth[:, 2], 0.0), bins), -1)
@@ -261,9 +243,6 @@ def weigh_bins(rates: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.n
 
     Args:
         rates: [n, ...] over any bins, NaN where unknown. seconds: [...] time in each bin, s.
-
-    Raises:
-        InputError: the bins differ, or no bin has both a rate and time.
     """
     if rates.shape[1:] != seconds.shape:
         raise InputError("seconds", f"bins {seconds.shape}", f"the bins of the rates, {rates.shape[1:]}")

@@ -93,11 +93,7 @@ def write_recording(path: str | Path, recording: CellRecording) -> None:
 
 
 def read_recording(path: str | Path) -> CellRecording:
-    """The inverse of `write_recording`.
-
-    Raises:
-        InputError: the file is missing, broken or of another kind.
-    """
+    """The inverse of `write_recording`."""
     own = [name for name in CellRecording._fields if name != "sums"]
     names = ["format", *own, *(_SUMS + name for name in BinnedSums._fields)]
 

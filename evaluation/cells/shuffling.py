@@ -128,9 +128,6 @@ def calibrate(
 
     Args:
         activity, bins, score, shuffles, seed: as in `shuffled_scores`.
-
-    Raises:
-        InputError: as in `shuffled_scores`.
     """
     _check_path(activity, bins)
     own = stream(seed, "calibration").integers(0, len(activity), (activity.shape[1],))

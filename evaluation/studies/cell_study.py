@@ -37,7 +37,7 @@ from tactile.base.random_streams import stream
 from tactile.base.settings import Settings
 
 _Scores = dict[str, np.ndarray]
-"""See `_score_sets`."""
+"""See `score_task`."""
 
 
 class _Sums:
@@ -101,32 +101,6 @@ class _Sums:
         return np.stack([np.hypot(x, y), np.abs(heading)], axis=-1)
 
 
-def _score_sets(study: StudyCourse, sets: CellSets, dtype: np.dtype) -> _Scores:
-    """Simulates B networks over the course in the given precision and scores them.
-
-    Memory does not depend on the length of the course, apart from the course itself. Drift is the packet,
-    followed round the torus, minus the pose that it would have without drift. The decoding error is the same
-    on the torus, the shortest way.
-
-    Returns:
-        By name, drift, drift_heading: [B] rms over the course, m and rad. drift_end, drift_heading_end: [B]
-            after the last step, m and rad. decoding, decoding_heading: [B] mean over the course, m and rad.
-            reseeded: [B] share of steps at which activity had died out. larger: [B] share of steps that
-            needed more than the smallest window. maps: [B, C, H, W] float32 mean activity of the chosen cells
-            in each place bin, NaN where the robot never was.
-    """
-    course = study.course._replace(
-        **{
-            name: np.asarray(getattr(study.course, name), dtype)
-            for name in ("motion", "noise", "turned", "energy")
-        }
-    )
-    sums = _Sums(study, len(sets.speed_noise))
-    for k, track in enumerate(walk(study.config, sets, course, study.chosen)):
-        sums.add(k * SEGMENT, track)
-    return sums.scores()
-
-
 FOLDER = "sets"
 """Name of the folder of a study's chunks."""
 
@@ -174,26 +148,18 @@ PARAMETERS = ("excite_sigma", "inhibit_sigma", "global_inhibition", "energy", "s
 
 
 class _CellStudy(NamedTuple):
-    """A checked study. parameters: [sets, 6] in the order of `PARAMETERS`."""
+    """A checked study, or a chunk of one: some of its parameter sets."""
 
     name: str
     plan: _CellPlan
     course: StudyCourse
-    parameters: np.ndarray
-
-
-class _Chunk(NamedTuple):
-    """A chunk of n parameter sets [n, 6]. size: sets of a whole chunk, which are simulated together."""
-
-    course: StudyCourse
-    parameters: np.ndarray
-    size: int
-    precision: Precision
+    parameters: np.ndarray  # [sets, 6] in the order of `PARAMETERS`
 
     @property
     def key(self) -> str:
         """Hash of all that decides the scores, apart from the code."""
-        content = hashlib.sha256(f"{self.course.config!r} {self.size} {self.precision}".encode())
+        plan = self.plan
+        content = hashlib.sha256(f"{self.course.config!r} {plan.chunk} {plan.precision}".encode())
         for array in jax.tree.leaves((self.course[2:], self.parameters)):
             content.update(f"{array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return content.hexdigest()[:16]
@@ -249,22 +215,41 @@ def run_cell_study(
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def tasks_of(study: _CellStudy) -> list[_Chunk]:
+def tasks_of(study: _CellStudy) -> list[_CellStudy]:
     """The chunks of a study."""
-    plan = study.plan
-    first = range(0, len(study.parameters), plan.chunk)
-    rows = [study.parameters[k : k + plan.chunk] for k in first]
-    return [_Chunk(study.course, each, plan.chunk, plan.precision) for each in rows]
+    size, rows = study.plan.chunk, study.parameters
+    return [study._replace(parameters=rows[k : k + size]) for k in range(0, len(rows), size)]
 
 
-def score_task(task: _Chunk) -> _Scores:
-    """The scores of a chunk; a part of one is filled up, so that its bits do not depend on the number."""
-    prepare_precision(task.precision)
-    rows = np.arange(task.size).clip(max=len(task.parameters) - 1)
+def score_task(task: _CellStudy) -> _Scores:
+    """Simulates the networks of a chunk over the course and scores them.
+
+    A part of a chunk is filled up, so that its bits do not depend on the number. Memory does not depend on
+    the length of the course, apart from the course itself. Drift is the packet, followed round the torus,
+    minus the pose that it would have without drift. The decoding error is the same on the torus, the shortest
+    way.
+
+    Returns:
+        By name of n networks, drift, drift_heading: [n] rms over the course, m and rad. drift_end,
+            drift_heading_end: [n] after the last step, m and rad. decoding, decoding_heading: [n] mean over
+            the course, m and rad. reseeded: [n] share of steps at which activity had died out. larger: [n]
+            share of steps that needed more than the smallest window. maps: [n, C, H, W] float32 mean activity
+            of the chosen cells in each place bin, NaN where the robot never was.
+    """
+    plan, study, count = task.plan, task.course, len(task.parameters)
+    prepare_precision(plan.precision)
+    rows = np.arange(plan.chunk).clip(max=count - 1)
     columns = dict(zip(PARAMETERS, task.parameters[rows].T, strict=True))
     noise = columns.pop("speed_noise"), columns.pop("heading_noise")
-    scores = _score_sets(task.course, CellSets(Network(**columns), *noise), np.dtype(task.precision))
-    return {name: column[: len(task.parameters)] for name, column in scores.items()}
+    precise = {
+        name: np.asarray(getattr(study.course, name), np.dtype(plan.precision))
+        for name in ("motion", "noise", "turned", "energy")
+    }
+    course, sets = study.course._replace(**precise), CellSets(Network(**columns), *noise)
+    sums = _Sums(study, plan.chunk)
+    for k, track in enumerate(walk(study.config, sets, course, study.chosen)):
+        sums.add(k * SEGMENT, track)
+    return {name: column[:count] for name, column in sums.scores().items()}
 
 
 def _save_scores(scores: _Scores, path: Path) -> None:

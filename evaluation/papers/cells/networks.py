@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from evaluation.papers.cells.panels import on_one_core, time_call
 from evaluation.papers.figure import Figure
@@ -40,12 +41,9 @@ def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> tuple[str, int
             own += [f"rat_simulation.seconds={steps / 50}", "rat_simulation.rate_hz=50", "seed=0"]
             own += ["rat_simulation.walk={}", "rat_simulation.views.every=5", "session.reserve=2048"]
             tasks = tasks_of(cell_study(Path("rat_box"), own))
-            first = tasks[0]._replace(parameters=tasks[0].parameters[:1], size=1)
-            score_task(first)
+            score_task(_whole(tasks[0]._replace(parameters=tasks[0].parameters[:1])))
             reset_peak_memory()
-            each = [
-                time_call(partial(score_task, task._replace(size=len(task.parameters)))) for task in tasks
-            ]
+            each = [time_call(partial(score_task, _whole(task))) for task in tasks]
             times = [sum(column) for column in zip(*each, strict=True)]
             rows[name] = [
                 *(1e6 * time / count for time in times),
@@ -58,6 +56,11 @@ def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> tuple[str, int
         f"at 10 Hz. Compiling is not included. Minutes are {how}. {found[0]}\n"
     )
     return note, sets, rows
+
+
+def _whole(task: Any) -> Any:
+    """A chunk that is not filled up."""
+    return task._replace(plan=task.plan.model_copy(update={"chunk": len(task.parameters)}))
 
 
 def network_table(result: tuple[str, int, dict[str, list[float]]]) -> Iterator[str]:
