@@ -47,21 +47,16 @@ MISSING_TRUTH = Finding(np.nan, note="no ground truth")
 
 
 class Metric(NamedTuple):
-    """One metric.
+    """One metric."""
 
-    Attributes:
-        name: key in `scorecard.json`. label: in words. unit: SI, `deg`, or ''.
-        direction: of better values. section: heading in the table.
-        compute: the finding from a `RunData`; None without the ground truth that it needs, and of quantities
-            that are made otherwise.
-    """
-
-    name: str
-    label: str
-    unit: str
-    direction: Direction
-    section: str
+    name: str  # key in `scorecard.json`
+    label: str  # in words
+    unit: str  # SI, `deg`, or ''
+    direction: Direction  # of better values
+    section: str  # heading in the table
     compute: Callable[[Any], Finding | None] = lambda _: None
+    """The finding from a `RunData`; None without the ground truth that it needs, and of quantities that are
+    made otherwise."""
 
     def quantity(self, finding: Finding) -> Quantity:
         """The value as written to a scorecard; NaN becomes None."""

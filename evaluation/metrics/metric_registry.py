@@ -13,14 +13,10 @@ from tactile.base.settings import Settings
 
 
 class MetricEntry(NamedTuple):
-    """A registered metric.
+    """A registered metric."""
 
-    Attributes:
-        config_class: its settings. build: makes the metric from these; its `compute` gets a `RunData`.
-    """
-
-    config_class: type[Settings]
-    build: Callable[[Any], Metric]
+    config_class: type[Settings]  # its settings
+    build: Callable[[Any], Metric]  # makes the metric from these; its `compute` gets a `RunData`
 
 
 METRICS: Registry[MetricEntry] = Registry("ratslam.metrics", "metric", MetricEntry, {})
