@@ -30,7 +30,7 @@ def write_pieces(path: Path, time: np.ndarray, piece: np.ndarray) -> None:
     Path(path).write_text("\n".join([",".join(PIECE_COLUMNS), *lines]) + "\n", encoding="utf-8")
 
 
-def read_pieces(path: Path, steps: int) -> np.ndarray:
+def _read_pieces(path: Path, steps: int) -> np.ndarray:
     """The piece [steps] of each step, 0 without the file.
 
     Raises:
@@ -134,7 +134,7 @@ def read_run(path: Path) -> RunArrays:
         doubt=doubt,
         unjudged=unjudged,
         warnings=read_manifest(path).warnings,
-        piece=read_pieces(path / PIECES, steps),
+        piece=_read_pieces(path / PIECES, steps),
         node_piece=node_piece,
         state=_states(path / "localisation.csv", steps),
     )

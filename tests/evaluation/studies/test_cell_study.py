@@ -21,7 +21,7 @@ from evaluation.studies.cell_study import (
     run_cell_study,
 )
 from evaluation.studies.executor import Executor
-from evaluation.studies.study_course import expected_poses, place_bins, read_course
+from evaluation.studies.study_course import expected_poses, read_course
 from ratslam.classic.batch import CellSets, Network, walk
 from ratslam.cli import main
 from ratslam.runs.build_session import build_session, open_observations, read_observations
@@ -99,11 +99,11 @@ def test_expected_poses_start_in_the_middle_of_the_torus_and_keep_lengths(box):
     assert np.allclose(again, course.expected)
 
 
-def test_every_position_lies_in_its_bin():
-    truth = np.random.default_rng(0).normal(size=(50, 3))
-    bin, x_edges, y_edges = place_bins(truth, 7)
-    row, column = np.divmod(bin, 7)
-    for edges, at, values in ((x_edges, column, truth[:, 0]), (y_edges, row, truth[:, 1])):
+def test_every_position_lies_in_its_bin(box):
+    course = read_course(load_config(box()), 200, False, 7, (), 0)
+    truth = np.load(box().parent / "walk.npz")["truth"]
+    row, column = np.divmod(course.bin, 7)
+    for edges, at, values in ((course.x_edges, column, truth[:, 0]), (course.y_edges, row, truth[:, 1])):
         assert (values >= edges[at] - 1e-12).all()
         assert (values <= edges[at + 1] + 1e-12).all()
 
