@@ -41,14 +41,10 @@ class PathBins(NamedTuple):
 
 
 class ShuffledScores(NamedTuple):
-    """Scores of cells and of their shuffles.
+    """Scores of cells and of their shuffles."""
 
-    Attributes:
-        score: [C] of the cells as recorded. shuffled: [S, C] of their shuffles. NaN where there is no score.
-    """
-
-    score: np.ndarray
-    shuffled: np.ndarray
+    score: np.ndarray  # [C] of the cells as recorded, NaN where there is no score
+    shuffled: np.ndarray  # [S, C] of their shuffles, NaN where there is no score
 
     @property
     def percentile(self) -> np.ndarray:

@@ -123,18 +123,18 @@ class _Progress:
         return INPUT_ERROR if self.failed else 0
 
 
-def _limit_threads() -> None:
-    """Limits NumPy to one thread in this process and its workers, so that results are equal.
+def _prepare() -> None:
+    """Prepares JAX, and limits NumPy to one thread in this process and its workers, so that results are equal.
 
     Call it before NumPy is loaded.
     """
     for name in THREADS:
         os.environ.setdefault(name, "1")
+    prepare_jax()
 
 
 def _study(arguments: argparse.Namespace) -> int:
-    _limit_threads()
-    prepare_jax()
+    _prepare()
     for option in REFUSED.get(arguments.preset, ()):
         if getattr(arguments, option):
             preset = arguments.preset
@@ -227,8 +227,7 @@ def _cells(arguments: argparse.Namespace) -> int:
 def _size(arguments: argparse.Namespace) -> int:
     if arguments.cycles < FEWEST_CYCLES:
         raise InputError("--cycles", str(arguments.cycles), f"{FEWEST_CYCLES} or more")
-    _limit_threads()
-    prepare_jax()
+    _prepare()
     from evaluation.studies.recommendation import (
         changed_settings_yaml,
         recommend,
