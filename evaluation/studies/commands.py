@@ -124,7 +124,7 @@ class _Progress:
 
 
 def _prepare() -> None:
-    """Prepares JAX, and limits NumPy to one thread in this process and its workers, so that results are equal.
+    """Prepares JAX; limits NumPy to one thread in this process and its workers, so that results are equal.
 
     Call it before NumPy is loaded.
     """
