@@ -36,26 +36,35 @@ _NUMBERS = ("t", "x", "y", "heading", "sd_x", "sd_y", "sd_heading", "lost")
 
 
 class RunProgress(NamedTuple):
-    """State of a run after N steps."""
+    """State of a run after N steps.
+
+    Attributes:
+        status: from the manifest; of a live session that ended before its map was finished, the outcome from
+            its report; without either `running`, or `killed`. total: final number of steps, if known.
+        path: [N, 3] online poses in the map frame, m, m, rad. sd: [3] standard deviations of the last pose;
+            NaN before it. odometry: [N, 3] from the start of this run. truth: [N, 2] m, NaN if unknown.
+        doubt: probability that the map is worse than odometry at the last step; None if it is not judged.
+        outcomes: number of steps by outcome. lost: number of steps lost. online_error: position error at the
+            last comparison with the truth, after alignment of the path, m.
+        checkpoint: steps of the last checkpoint. rate: mean steps per second, by file dates.
+        silence: time since the last write of the run, s. warnings: about the input.
+    """
 
     name: str
     status: str
-    """From the manifest; of a live session that ended before its map was finished, the outcome from its
-    report; without either `running`, or `killed`."""
-    total: int | None  # final number of steps, if known
-    path: np.ndarray  # [N, 3] online poses in the map frame, m, m, rad
-    sd: np.ndarray  # [3] standard deviations of the last pose; NaN before it
-    odometry: np.ndarray  # [N, 3] from the start of this run
-    truth: np.ndarray  # [N, 2] m, NaN if unknown
-    outcomes: Mapping[str, int]  # number of steps by outcome
-    lost: int  # number of steps lost
-    online_error: float | None  # position error at the last comparison with the truth, after alignment, m
-    checkpoint: int  # steps of the last checkpoint
-    rate: float | None  # mean steps per second, by file dates
-    silence: float  # time since the last write of the run, s
+    total: int | None
+    path: np.ndarray
+    sd: np.ndarray
+    odometry: np.ndarray
+    truth: np.ndarray
+    outcomes: Mapping[str, int]
+    lost: int
+    online_error: float | None
+    checkpoint: int
+    rate: float | None
+    silence: float
     doubt: float | None = None
-    """Probability at the last step that the map is worse than odometry; None if it is not judged."""
-    warnings: tuple[str, ...] = ()  # about the input
+    warnings: tuple[str, ...] = ()
 
     @property
     def length(self) -> float:

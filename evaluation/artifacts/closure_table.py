@@ -23,13 +23,18 @@ KEYS = ("step", "match_step", "verdict")
 
 
 class ClosureTable(NamedTuple):
-    """The closures of a run, n of them, in the order of the file."""
+    """The closures of a run, n of them, in the order of the file.
+
+    Attributes:
+        steps: [n, 2] the earlier and the later step that a closure joins, counted from the first step of
+            this run: negative in the run that this one continues.
+        verdicts: [n] `accepted`, or why it is no closure of the map.
+        evidence: the other columns, [n] each, by name.
+    """
 
     steps: np.ndarray
-    """[n, 2] the earlier and the later step that a closure joins, counted from the first step of this run:
-    negative in the run that this one continues."""
-    verdicts: list[str]  # [n] `accepted`, or why it is no closure of the map
-    evidence: Mapping[str, np.ndarray]  # the other columns, [n] each, by name
+    verdicts: list[str]
+    evidence: Mapping[str, np.ndarray]
 
     def accepted(self) -> np.ndarray:
         """[n] bool, which are closures of the map."""
@@ -37,7 +42,11 @@ class ClosureTable(NamedTuple):
 
 
 def read_closure_table(directory: Path) -> ClosureTable:
-    """Reads the closures of a run directory; none without the file."""
+    """Reads the closures of a run directory; none without the file.
+
+    Raises:
+        InputError: a line is malformed.
+    """
     file = directory / "closures.csv"
     if not file.exists():
         return ClosureTable(np.zeros((0, 2), int), [], {})
@@ -59,7 +68,11 @@ def read_closure_table(directory: Path) -> ClosureTable:
 
 
 def read_closures(directory: Path) -> np.ndarray:
-    """The pairs of steps [n, 2] of this run that are joined by accepted closures; n is 0 without the file."""
+    """The pairs of steps [n, 2] of this run that are joined by accepted closures; n is 0 without the file.
+
+    Raises:
+        InputError: a line is malformed.
+    """
     table = read_closure_table(directory)
     return table.steps[table.accepted() & (table.steps >= 0).all(axis=1)]
 
@@ -140,5 +153,9 @@ def write_changes(path: Path, changes: Sequence[ChangeRow]) -> None:
 
 
 def read_changes(path: Path) -> list[ChangeRow]:
-    """Reads the places."""
+    """Reads the places.
+
+    Raises:
+        InputError: a line is malformed.
+    """
     return read_rows(path, f"the columns {', '.join(COLUMNS)}", ChangeRow.parse)

@@ -22,7 +22,11 @@ from tactile.base.files import write_atomically, write_text_atomically
 
 
 def read_grid(path: str | Path) -> OccupancyGrid:
-    """Reads the map of a run with a grid."""
+    """Reads the map of a run with a grid.
+
+    Raises:
+        InputError: the file is missing or malformed.
+    """
 
     def parse(probability: np.ndarray, origin: np.ndarray, cell: np.ndarray) -> OccupancyGrid:
         grid = OccupancyGrid(probability.astype(float), origin.astype(float).reshape(2), float(cell))
@@ -41,7 +45,11 @@ def write_grid_truth(path: str | Path, truth: GridTruth, start: np.ndarray) -> N
 
 
 def read_grid_truth(path: str | Path) -> tuple[GridTruth, np.ndarray]:
-    """The inverse of `write_grid_truth`."""
+    """The inverse of `write_grid_truth`.
+
+    Raises:
+        InputError: the file is missing or malformed.
+    """
 
     def parse(*arrays: np.ndarray) -> tuple[GridTruth, np.ndarray]:
         occupied, inside, segments, start = arrays
@@ -58,11 +66,16 @@ _HEAD = re.compile(rb"P5(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^
 
 
 class Nav2Map(NamedTuple):
-    """A map as map_server publishes it."""
+    """A map as map_server publishes it.
 
-    cell: np.ndarray  # [H, W] int, occupancy in 0..100 or -1 for unknown; row j counts y upwards
-    origin: np.ndarray  # [3] x, y (m) and yaw (rad) of the lower left corner
-    resolution: float  # cell side length, m
+    Attributes:
+        cell: [H, W] int, occupancy in 0..100 or -1 for unknown; row j counts y upwards.
+        origin: [3] x, y (m) and yaw (rad) of the lower left corner. resolution: cell side length, m.
+    """
+
+    cell: np.ndarray
+    origin: np.ndarray
+    resolution: float
 
 
 def write_nav2(folder: Path, grid: OccupancyGrid, name: str = "map") -> None:
@@ -84,7 +97,11 @@ def write_nav2(folder: Path, grid: OccupancyGrid, name: str = "map") -> None:
 
 
 def read_nav2(path: str | Path) -> Nav2Map:
-    """Reads map.yaml and its image like map_server (modes trinary, scale and raw; binary 8-bit PGM)."""
+    """Reads map.yaml and its image like map_server (modes trinary, scale and raw; binary 8-bit PGM).
+
+    Raises:
+        InputError: a file or a key is missing or invalid.
+    """
     path = Path(path)
     given = read_plain_yaml(path, "the map.yaml of a map_server")
     keys = ("resolution", "free_thresh", "occupied_thresh")

@@ -16,23 +16,34 @@ RUNNING = "running"
 
 
 class Manifest(NamedTuple):
-    """The manifest of a run."""
+    """The manifest of a run.
+
+    Attributes:
+        status: `running`, `complete` or `interrupted`; of a live session that ended before its map was
+            finished, the outcome from its report. source: name of the recording or simulation.
+        total: final number of steps, if known. seed: of the session, if known.
+        versions: of the program, its libraries and Python. continued: whether it went on from a map.
+        killed: it has not ended, and no process writes it. digest: sha256 of its recording or simulation,
+            '' of a live session. warnings: about the input, a sentence each.
+    """
 
     status: str = RUNNING
-    """`running`, `complete` or `interrupted`; of a live session that ended before its map was finished, the
-    outcome from its report."""
-    source: str = ""  # name of the recording or simulation
-    total: int | None = None  # final number of steps, if known
-    seed: int | None = None  # of the session, if known
-    versions: Mapping[str, str] = {}  # of the program, its libraries and Python
-    continued: bool = False  # whether it went on from a map
-    killed: bool = False  # it has not ended, and no process writes it
-    digest: str = ""  # sha256 of its recording or simulation, '' of a live session
-    warnings: tuple[str, ...] = ()  # about the input, a sentence each
+    source: str = ""
+    total: int | None = None
+    seed: int | None = None
+    versions: Mapping[str, str] = {}
+    continued: bool = False
+    killed: bool = False
+    digest: str = ""
+    warnings: tuple[str, ...] = ()
 
 
 def read_manifest(directory: Path) -> Manifest:
-    """Reads the manifest; that of a run without the file has no versions."""
+    """Reads the manifest; that of a run without the file has no versions.
+
+    Raises:
+        InputError: the file, or the report of a live session, is malformed.
+    """
     file = directory / "manifest.json"
     found = read_json(file, "the manifest of a run", _parse) if file.exists() else Manifest()
     if found.status != RUNNING:

@@ -17,10 +17,15 @@ NAME = "closure_views.npz"
 
 
 class ClosureViews(NamedTuple):
-    """Views of n steps."""
+    """Views of n steps.
 
-    step: np.ndarray  # [n] increasing, counted from the first step of this run
-    view: np.ndarray  # [n, R, C] uint8, brightness
+    Attributes:
+        step: [n] increasing, counted from the first step of this run.
+        view: [n, R, C] uint8, brightness.
+    """
+
+    step: np.ndarray
+    view: np.ndarray
 
 
 def eight_bit(view: np.ndarray) -> np.ndarray:
@@ -35,7 +40,11 @@ def write_closure_views(path: Path, views: ClosureViews) -> None:
 
 
 def read_closure_views(directory: Path) -> ClosureViews | None:
-    """Reads the views of a run directory; None without the file."""
+    """Reads the views of a run directory; None without the file.
+
+    Raises:
+        InputError: the file is malformed.
+    """
 
     def parse(step: np.ndarray, view: np.ndarray) -> ClosureViews:
         if step.ndim != 1 or view.ndim != 3 or len(step) != len(view) or view.dtype != np.uint8:
@@ -51,13 +60,20 @@ _WHITE = 255
 
 
 class WhiskerViews(NamedTuple):
-    """Whisker images of N steps and a head with R rings of C whiskers."""
+    """Whisker images of N steps and a head with R rings of C whiskers.
 
-    view: np.ndarray  # [N, R, C] pixel values in 0..1, 0 without contact
-    alive: np.ndarray  # [N, R, C] bool, the whisker has a signal
-    azimuth: np.ndarray  # [C] direction of the whiskers of each column, rad counter-clockwise from ahead
-    length: np.ndarray  # [R] length of the whiskers of each ring, m
-    tallest: float  # obstacle height of pixel value 1, m
+    Attributes:
+        view: [N, R, C] pixel values in 0..1, 0 without contact.
+        alive: [N, R, C] bool, the whisker has a signal.
+        azimuth: [C] direction of the whiskers of each column, rad counter-clockwise from ahead.
+        length: [R] length of the whiskers of each ring, m. tallest: obstacle height of pixel value 1, m.
+    """
+
+    view: np.ndarray
+    alive: np.ndarray
+    azimuth: np.ndarray
+    length: np.ndarray
+    tallest: float
 
 
 def write_whisker_views(path: str | Path, images: WhiskerViews) -> None:
@@ -70,7 +86,11 @@ def write_whisker_views(path: str | Path, images: WhiskerViews) -> None:
 
 
 def read_whisker_views(path: str | Path) -> WhiskerViews:
-    """The inverse of `write_whisker_views`, except for rounding."""
+    """The inverse of `write_whisker_views`, except for rounding.
+
+    Raises:
+        InputError: the file is missing or malformed.
+    """
 
     def parse(view: np.ndarray, *arrays: np.ndarray) -> WhiskerViews:
         alive, azimuth, length, tallest = arrays

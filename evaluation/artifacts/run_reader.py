@@ -62,7 +62,11 @@ def _refuse_merged(folder: Path) -> None:
 
 
 def read_session_steps(folder: Path) -> list[int]:
-    """Number of steps of each session of a merged folder, in the order of its map."""
+    """Number of steps of each session of a merged folder, in the order of its map.
+
+    Raises:
+        InputError: merge.json is missing or malformed.
+    """
     expected = f"the {MERGE_REPORT} of a merged map"
     return read_json(
         folder / MERGE_REPORT, expected, lambda content: [int(count) for count in content["steps"]]
@@ -157,7 +161,11 @@ def has_steps(path: Path) -> bool:
 
 
 def read_scorecard(path: Path) -> Scorecard:
-    """Reads the scorecard in a run directory."""
+    """Reads the scorecard in a run directory.
+
+    Raises:
+        InputError: it is missing or malformed.
+    """
     file = path / "scorecard.json"
     return read_json(file, "the directory of a scored run", Scorecard.model_validate)
 
@@ -173,7 +181,11 @@ def write_walls(path: str | Path, walls: np.ndarray) -> None:
 
 
 def read_walls(path: Path) -> np.ndarray:
-    """Reads the walls [B, 5] of a run directory; B is 0 without the file."""
+    """Reads the walls [B, 5] of a run directory; B is 0 without the file.
+
+    Raises:
+        InputError: a line is malformed.
+    """
     file = path / "walls.csv"
     if not file.exists():
         return np.zeros((0, len(WALL_COLUMNS)))

@@ -29,29 +29,39 @@ from tactile.base.files import write_atomically
 
 
 class CellScores(NamedTuple):
-    """Scores of n cells, each [n]; NaN where undefined, as for a cell without activity."""
+    """Scores of n cells, each [n]; NaN where undefined, as for a cell without activity.
 
-    cell: np.ndarray  # index in the flattened network
-    sheet_x: np.ndarray  # place on the torus, m
-    sheet_y: np.ndarray  # place on the torus, m
-    sheet_heading: np.ndarray  # rad
-    mean_rate: np.ndarray  # in the box, Hz
-    peak_rate: np.ndarray  # of the rate map, Hz
-    information: np.ndarray  # bits/spike
-    information_rate: np.ndarray  # bits/s
-    sparsity: np.ndarray  # (0, 1]
-    selectivity: np.ndarray  # peak over mean
-    coherence: np.ndarray  # of the map without smoothing, z
-    fields: np.ndarray  # number
-    field_area: np.ndarray  # of the largest, m^2
-    border: np.ndarray  # border score
-    vector_length: np.ndarray  # of the tuning curve, [0, 1]
-    direction: np.ndarray  # preferred, rad
-    heading_peak: np.ndarray  # Hz
-    rayleigh_z: np.ndarray  # Rayleigh test
-    rayleigh_p: np.ndarray  # Rayleigh test
-    heading_information: np.ndarray  # of the tuning curve, bits/spike
-    conjunctive: np.ndarray  # the smaller of `information` and `heading_information`, bits/spike
+    Attributes:
+        cell: index in the flattened network. sheet_x, sheet_y: place on the torus, m. sheet_heading: rad.
+        mean_rate: in the box, Hz. peak_rate: of the rate map, Hz. information: bits/spike.
+        information_rate: bits/s. sparsity: (0, 1]. selectivity: peak over mean. coherence: of the map
+            without smoothing, z. fields: number. field_area: of the largest, m^2. border: border score.
+        vector_length: of the tuning curve, [0, 1]. direction: preferred, rad. heading_peak: Hz.
+        rayleigh_z, rayleigh_p: Rayleigh test. heading_information: of the tuning curve, bits/spike.
+        conjunctive: the smaller of `information` and `heading_information`, bits/spike.
+    """
+
+    cell: np.ndarray
+    sheet_x: np.ndarray
+    sheet_y: np.ndarray
+    sheet_heading: np.ndarray
+    mean_rate: np.ndarray
+    peak_rate: np.ndarray
+    information: np.ndarray
+    information_rate: np.ndarray
+    sparsity: np.ndarray
+    selectivity: np.ndarray
+    coherence: np.ndarray
+    fields: np.ndarray
+    field_area: np.ndarray
+    border: np.ndarray
+    vector_length: np.ndarray
+    direction: np.ndarray
+    heading_peak: np.ndarray
+    rayleigh_z: np.ndarray
+    rayleigh_p: np.ndarray
+    heading_information: np.ndarray
+    conjunctive: np.ndarray
 
 
 def analyse_cells(recording: CellRecording, gain: float | None = None) -> CellScores:

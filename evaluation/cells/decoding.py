@@ -21,23 +21,32 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose
 
-WINDOW = 0.5
-"""Time over which activity is averaged, s."""
-
 
 class Decoding(NamedTuple):
-    """Decoded positions in M windows."""
+    """Decoded positions in M windows.
 
-    time: np.ndarray  # [M] s, middle of the window
-    truth: np.ndarray  # [M, 2] m
-    decoded: np.ndarray  # [M, 2] m
-    error: np.ndarray  # [M] distance between them, m
-    median: float  # of the error, m
-    control: np.ndarray  # [shifts] median errors of circularly shifted activity, m
+    Attributes:
+        time: [M] s, middle of the window. truth, decoded: [M, 2] m. error: [M] distance between them, m.
+        median: of the error, m. control: [shifts] median errors of circularly shifted activity, m.
+    """
+
+    time: np.ndarray
+    truth: np.ndarray
+    decoded: np.ndarray
+    error: np.ndarray
+    median: float
+    control: np.ndarray
 
 
 def decode_positions(
-    recording: CellRecording, *, block: float = 20.0, shifts: int = 100, seed: int = 0
+    recording: CellRecording,
+    *,
+    window: float = 0.5,
+    block: float = 20.0,
+    bins: int = 20,
+    smoothing: float = 1.5,
+    shifts: int = 100,
+    seed: int = 0,
 ) -> Decoding:
     """Decodes the position of the rat from the chosen cells (Zhang et al. 1998: Bayes, independent Poisson
     cells, flat prior), cross-validated: odd blocks of time with the maps of the even ones and the other way
@@ -48,20 +57,21 @@ def decode_positions(
     round the session by at least a tenth of it against the true ones.
 
     Args:
-        block: time of the blocks that by turns make the maps and test them, s; a place visited too shortly in
-            the one half is never decoded in the other. shifts: of the control.
+        window: time over which activity is averaged, s. block: time of the blocks that by turns make the maps
+            and test them, s; a place visited too shortly in the one half is never decoded in the other.
+            bins: along each side of the box. smoothing: of the maps, bins. shifts: of the control.
 
     Raises:
         InputError: lengths differ, no pose is known, the path has no area or is shorter than four blocks.
     """
-    edges = arena_edges(recording.truth)
+    edges = arena_edges(recording.truth, bins)
     samples = box_samples(recording.time, recording.truth, recording.activity, *edges, 1)
     number = ((samples.time - samples.time[0]) // block).astype(int)
     if number[-1] < 3:
         raise InputError(
             "recording", f"{samples.time[-1] - samples.time[0]:.1f} s", f"four blocks of {block} s"
         )
-    halves = [_decode_half(samples, number % 2 == half, edges) for half in (0, 1)]
+    halves = [_decode_half(samples, number % 2 == half, edges, window, smoothing) for half in (0, 1)]
     time, truth, decoded = (np.concatenate(parts) for parts in zip(*halves, strict=True))
     order = np.argsort(time, kind="stable")
     time, truth, decoded = time[order], truth[order], decoded[order]
@@ -98,20 +108,25 @@ def log_posterior(
 
 
 def _decode_half(
-    samples: BoxSamples, train: np.ndarray, edges: tuple[np.ndarray, np.ndarray]
+    samples: BoxSamples,
+    train: np.ndarray,
+    edges: tuple[np.ndarray, np.ndarray],
+    seconds: float,
+    smoothing: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times [M] s, true and decoded places [M, 2] m of the windows outside `train` [samples] bool."""
+    """Times [M] s, true and decoded places [M, 2] m of the windows of `seconds` outside `train` [samples]
+    bool."""
     maps = sum_samples(BoxSamples(*(each[train] for each in samples)), *edges, 1)
-    rates = rate_maps(maps)
+    rates = rate_maps(maps, smoothing)
     test = BoxSamples(*(each[~train] for each in samples))
-    _, window = np.unique((test.time - samples.time[0]) // WINDOW, return_inverse=True)
-    seconds = np.bincount(window, test.seconds)
+    _, window = np.unique((test.time - samples.time[0]) // seconds, return_inverse=True)
+    spent = np.bincount(window, test.seconds)
     counts = _sum_windows(window, test.activity * test.seconds[:, None])
     time, truth = (
         _sum_windows(window, each) / np.bincount(window)[:, None]
         for each in (test.time[:, None], test.position)
     )
-    posterior = log_posterior(counts, seconds, rates, np.zeros(rates.shape[1:]))
+    posterior = log_posterior(counts, spent, rates, np.zeros(rates.shape[1:]))
     row, column = np.divmod(posterior.reshape(len(counts), -1).argmax(axis=1), rates.shape[2])
     x, y = ((each[1:] + each[:-1]) / 2 for each in edges)
     return time[:, 0], truth, np.stack([x[column], y[row]], axis=1)
@@ -130,6 +145,9 @@ def packet_drift(recording: CellRecording) -> np.ndarray:
     packet's. The torus tells a pose only up to its sides; the error is unwrapped over time: between
     successive known poses it takes the shortest way. An injection that moves the packet by more than half a
     side is thus counted to the nearest copy of its target.
+
+    Raises:
+        InputError: lengths differ or no pose is known.
     """
     moved = truth_in_sheet(recording)
     known = np.flatnonzero(known_poses(moved))
@@ -144,7 +162,11 @@ def packet_drift(recording: CellRecording) -> np.ndarray:
 
 def truth_in_sheet(recording: CellRecording) -> np.ndarray:
     """[T, 3] true poses in the frame of the sheet, m, m, rad, not folded; the first known one is the
-    packet's."""
+    packet's.
+
+    Raises:
+        InputError: lengths differ or no pose is known.
+    """
     check_lengths(recording.time, recording.truth, recording.packet)
     first = np.flatnonzero(known_poses(recording.truth))[0]
     truth = np.asarray(recording.truth, np.float64)

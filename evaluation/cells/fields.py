@@ -11,12 +11,17 @@ from tactile.base.errors import InputError
 
 
 class Fields(NamedTuple):
-    """The F fields of n cells."""
+    """The F fields of n cells.
 
-    label: np.ndarray  # [n, H, W] int32, 0 outside fields, otherwise 1 + the row of the field below
-    cell: np.ndarray  # [F] index of the cell among the n, in order
-    bins: np.ndarray  # [F] size
-    peak: np.ndarray  # [F] highest rate
+    Attributes:
+        label: [n, H, W] int32, 0 outside fields, otherwise 1 + the row of the field in the other arrays.
+        cell: [F] index of the cell among the n, in order. bins: [F] size. peak: [F] highest rate.
+    """
+
+    label: np.ndarray
+    cell: np.ndarray
+    bins: np.ndarray
+    peak: np.ndarray
 
     @property
     def number(self) -> np.ndarray:

@@ -41,6 +41,9 @@ def autocorrelogram(rates: np.ndarray) -> np.ndarray:
         for 20 x 20 bins); the centre is lag 0. 0 where the common bins are flat in one of the two maps (as in
         opexebo), NaN where the common bins are fewer than a full map has at the largest kept lags, and NaN
         everywhere for a map that is flat or has no visits.
+
+    Raises:
+        InputError: the array is no batch of maps or has no bins.
     """
     rates = np.asarray(rates, float)
     if rates.ndim != 3 or 0 in rates.shape[1:]:
@@ -211,10 +214,14 @@ _FLAT = 1e-12
 
 
 class Lattice(NamedTuple):
-    """The symmetry of a lattice."""
+    """The symmetry of a lattice.
 
-    onto: tuple[float, ...]  # angles that map it onto itself, degrees
-    between: tuple[float, ...]  # angles that move its points farthest, degrees
+    Attributes:
+        onto: angles that map it onto itself, degrees. between: angles that move its points farthest, degrees.
+    """
+
+    onto: tuple[float, ...]
+    between: tuple[float, ...]
 
 
 HEXAGONAL = Lattice((60.0, 120.0), (30.0, 90.0, 150.0))
@@ -222,14 +229,20 @@ SQUARE = Lattice((90.0,), (45.0, 135.0))
 
 
 class _Annuli(NamedTuple):
-    """Bins of half an autocorrelogram in the order of their radius; it is symmetric, so half suffices."""
+    """Bins of half an autocorrelogram in the order of their radius; it is symmetric, so half suffices.
 
-    half: np.ndarray  # [P] flat indices
-    rotation: sparse.csr_array  # [A * P, h * w] bilinear rotation by each angle
-    starts: np.ndarray  # [S] where the distinct sums start
-    below: np.ndarray  # [R + 1] how many of these sums have a radius < r, for r = 0 .. R bins
-    within: np.ndarray  # [R + 1] how many have a radius <= r
-    bins: np.ndarray  # [S + 1] in the first sums
+    Attributes:
+        half: [P] flat indices. rotation: [A * P, h * w] bilinear rotation by each angle.
+        starts: [S] where the distinct sums start. below, within: [R + 1] how many of these sums have a radius
+            < r, <= r, for r = 0 .. R bins. bins: [S + 1] in the first sums.
+    """
+
+    half: np.ndarray
+    rotation: sparse.csr_array
+    starts: np.ndarray
+    below: np.ndarray
+    within: np.ndarray
+    bins: np.ndarray
 
 
 def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -> np.ndarray:
@@ -240,6 +253,9 @@ def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -
 
     Args:
         autocorrelograms: [n, h, w] as from `autocorrelogram`, odd sides. lattice: its symmetry.
+
+    Raises:
+        InputError: the array is no batch of maps with odd sides.
     """
     maps = np.asarray(autocorrelograms, float)
     if maps.ndim != 3 or any(side % 2 == 0 for side in maps.shape[1:]):
@@ -385,6 +401,9 @@ def measure_lattice(
         spacing: [n] m. orientation: [n] rad from the x axis to the next row of peaks anticlockwise, in
             0 .. pi / 3 for a hexagonal and 0 .. pi / 2 for a square lattice. NaN where there are too few
             peaks.
+
+    Raises:
+        InputError: the size of a bin is not positive.
     """
     if not bin_size > 0:
         raise InputError("bin_size", f"{bin_size}", "a length above 0 m")

@@ -24,6 +24,9 @@ def rate_maps(sums: BinnedSums, smoothing: float = 1.5, least_seconds: float = 0
 
     Args:
         smoothing: standard deviation of the Gaussian, bins; 0 for none.
+
+    Raises:
+        InputError: the sums do not fit each other, or no bin was visited long enough.
     """
     if sums.place.shape[1:] != sums.seconds.shape:
         raise InputError(
@@ -35,13 +38,22 @@ def rate_maps(sums: BinnedSums, smoothing: float = 1.5, least_seconds: float = 0
     return rates
 
 
-def tuning_curves(sums: BinnedSums, least_seconds: float = 0.1) -> np.ndarray:
-    """[cells, B] mean activity at each heading, NaN at headings held for less than `least_seconds`."""
+def tuning_curves(sums: BinnedSums, smoothing: float = 0.0, least_seconds: float = 0.1) -> np.ndarray:
+    """[cells, B] mean activity at each heading, NaN at headings held for less than `least_seconds`.
+
+    Args:
+        smoothing: standard deviation of the Gaussian round the circle, bins; 0 for none.
+
+    Raises:
+        InputError: the sums do not fit each other, or no heading was held long enough.
+    """
     if sums.heading.shape[1:] != sums.heading_seconds.shape:
         found, expected = f"{sums.heading.shape[1]} bins", f"{len(sums.heading_seconds)} of heading_seconds"
         raise InputError("sums.heading", found, expected)
     visited = _visited(sums.heading_seconds, least_seconds)
-    return np.asarray(sums.heading / np.where(visited, sums.heading_seconds, np.nan))
+    kernel = _kernel(len(visited), smoothing, "wrap").T
+    seconds = np.where(visited, sums.heading_seconds @ kernel, np.nan)
+    return (sums.heading @ kernel) / seconds
 
 
 def smooth_rates(rates: np.ndarray, seconds: np.ndarray, sigma: float) -> np.ndarray:
@@ -66,18 +78,23 @@ def smooth_plane(values: np.ndarray, sigma: float) -> np.ndarray:
     spread; smooth `numpy.nan_to_num(values)` and the mask of visited bins and divide to ignore them.
     """
     height, width = values.shape[-2:]
-    return _kernel(height, sigma) @ values @ _kernel(width, sigma).T
+    return _kernel(height, sigma, "reflect") @ values @ _kernel(width, sigma, "reflect").T
 
 
 class BoxSamples(NamedTuple):
-    """The M samples of a path whose pose is known and inside the box."""
+    """The M samples of a path whose pose is known and inside the box.
 
-    time: np.ndarray  # [M] s
-    seconds: np.ndarray  # [M] s
-    position: np.ndarray  # [M, 2] m
-    place: np.ndarray  # [M] int bin in the flattened [H, W]
-    heading: np.ndarray  # [M] int bin
-    activity: np.ndarray  # [M, C]
+    Attributes:
+        time, seconds: [M] s. position: [M, 2] m. place: [M] int bin in the flattened [H, W]. heading: [M] int
+            bin. activity: [M, C].
+    """
+
+    time: np.ndarray
+    seconds: np.ndarray
+    position: np.ndarray
+    place: np.ndarray
+    heading: np.ndarray
+    activity: np.ndarray
 
 
 def bin_activity(
@@ -201,7 +218,11 @@ def arena_edges(truth: np.ndarray, bins: int = 20) -> tuple[np.ndarray, np.ndarr
 
 
 def known_poses(truth: np.ndarray) -> np.ndarray:
-    """[T] bool, the pose [T, 3] is known."""
+    """[T] bool, the pose [T, 3] is known.
+
+    Raises:
+        InputError: no pose is known.
+    """
     known = np.isfinite(truth).all(axis=1)
     if not known.any():
         raise InputError("truth", "no known pose: the path is NaN throughout", "m, m, rad", "record a truth")
@@ -219,6 +240,9 @@ def place_index(truth: np.ndarray, x_edges: np.ndarray, y_edges: np.ndarray) -> 
     """[T] int bin of each pose [T, 3] in the flattened [H, W], -1 outside and where the position is unknown.
 
     The last edges belong to the last bins.
+
+    Raises:
+        InputError: no pose is known.
     """
     known_poses(truth)
     row, column = _interval(truth[:, 1], y_edges), _interval(truth[:, 0], x_edges)
@@ -227,7 +251,11 @@ def place_index(truth: np.ndarray, x_edges: np.ndarray, y_edges: np.ndarray) -> 
 
 def heading_index(truth: np.ndarray, bins: int) -> np.ndarray:
     """[T] int bin of the heading of each pose [T, 3], -1 where it is unknown; bin b is centred on 2 pi b /
-    bins."""
+    bins.
+
+    Raises:
+        InputError: no pose is known.
+    """
     known_poses(truth)
     known = np.isfinite(truth[:, 2])
     return np.where(known, circle_bin(np.where(known, truth[:, 2], 0.0), bins), -1)
@@ -243,6 +271,9 @@ def weigh_bins(rates: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.n
 
     Args:
         rates: [n, ...] over any bins, NaN where unknown. seconds: [...] time in each bin, s.
+
+    Raises:
+        InputError: the bins differ, or no bin has both a rate and time.
     """
     if rates.shape[1:] != seconds.shape:
         raise InputError("seconds", f"bins {seconds.shape}", f"the bins of the rates, {rates.shape[1:]}")
@@ -275,12 +306,12 @@ def _visited(seconds: np.ndarray, least_seconds: float) -> np.ndarray:
     return visited
 
 
-def _kernel(bins: int, sigma: float) -> np.ndarray:
+def _kernel(bins: int, sigma: float, mode: str) -> np.ndarray:
     """[bins, bins] matrix that smooths a column of `bins` values."""
     eye = np.eye(bins)
     from scipy.ndimage import gaussian_filter1d  # slow to import
 
-    return gaussian_filter1d(eye, sigma, axis=0, mode="reflect", truncate=4.0) if sigma > 0 else eye
+    return gaussian_filter1d(eye, sigma, axis=0, mode=mode, truncate=4.0) if sigma > 0 else eye
 
 
 def coherence(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:

@@ -19,31 +19,44 @@ FORMAT = "ratslam-cells-1"
 class BinnedSums(NamedTuple):
     """The activity of all cells, summed over time into bins of the true position and heading.
 
-    Cells are in the order of the flattened network [K, N, N] over heading, y, x.
+    Attributes:
+        x_edges: [W + 1] m. y_edges: [H + 1] m. seconds: [H, W] time in each bin, s. place: [cells, H, W]
+            activity times time, s; the mean activity in a bin is `place / seconds`. heading_seconds: [B] time
+            at each heading, s; bin b is centred on 2 pi b / B rad. heading: [cells, B] activity times time,
+            s. Cells are in the order of the flattened network [K, N, N] over heading, y, x.
     """
 
-    x_edges: np.ndarray  # [W + 1] m
-    y_edges: np.ndarray  # [H + 1] m
-    seconds: np.ndarray  # [H, W] time in each bin
-    place: np.ndarray  # [cells, H, W] activity times time, s; the mean activity in a bin is `place / seconds`
-    heading_seconds: np.ndarray  # [B] time at each heading, s; bin b is centred on 2 pi b / B rad
-    heading: np.ndarray  # [cells, B] activity times time, s
+    x_edges: np.ndarray
+    y_edges: np.ndarray
+    seconds: np.ndarray
+    place: np.ndarray
+    heading_seconds: np.ndarray
+    heading: np.ndarray
 
 
 class CellRecording(NamedTuple):
-    """The activity of pose cells over the T steps of a session."""
+    """The activity of pose cells over the T steps of a session.
 
-    shape: tuple[int, int, int]  # (K, N, N) cells of the network over heading, y, x
-    cell_size: float  # side of a cell, m
-    time: np.ndarray  # [T] s
-    truth: np.ndarray  # [T, 3] true pose, m, m, rad, NaN where unknown
-    packet: np.ndarray  # [T, 3] decoded pose over x, y, heading, cells
-    energy: np.ndarray  # [T] injected by views; of a belief its total
-    place: np.ndarray  # [T] int32 id of the place or view template, -1 for none
-    cell: np.ndarray  # [C] int32 indices of the chosen cells in the flattened network
+    Attributes:
+        shape: (K, N, N) cells of the network over heading, y, x. cell_size: side of a cell, m.
+        time: [T] s. truth: [T, 3] true pose, m, m, rad, NaN where unknown. packet: [T, 3] decoded pose over
+            x, y, heading, cells. energy: [T] injected by views; of a belief its total. place: [T] int32 id of
+            the place or view template, -1 for none.
+        cell: [C] int32 indices of the chosen cells in the flattened network. activity: [T, C] float32 of the
+            chosen cells; the activity of all cells sums to 1, or to the certainty of a belief.
+        sums: of all cells, None if they were not summed.
+    """
+
+    shape: tuple[int, int, int]
+    cell_size: float
+    time: np.ndarray
+    truth: np.ndarray
+    packet: np.ndarray
+    energy: np.ndarray
+    place: np.ndarray
+    cell: np.ndarray
     activity: np.ndarray
-    """[T, C] float32 of the chosen cells; that of all cells sums to 1, or to the certainty of a belief."""
-    sums: BinnedSums | None  # of all cells, None if they were not summed
+    sums: BinnedSums | None
 
     @property
     def packet_pose(self) -> np.ndarray:
@@ -80,7 +93,11 @@ def write_recording(path: str | Path, recording: CellRecording) -> None:
 
 
 def read_recording(path: str | Path) -> CellRecording:
-    """The inverse of `write_recording`."""
+    """The inverse of `write_recording`.
+
+    Raises:
+        InputError: the file is missing, broken or of another kind.
+    """
     own = [name for name in CellRecording._fields if name != "sums"]
     names = ["format", *own, *(_SUMS + name for name in BinnedSums._fields)]
 

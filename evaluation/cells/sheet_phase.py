@@ -35,6 +35,9 @@ def folded_maps(recording: CellRecording, bins: int = 21) -> tuple[np.ndarray, n
 
     The true path is moved into the frame of the sheet (`decoding.truth_in_sheet`) and folded, so the box may
     have any heading. Bin b is centred on b / bins of the side.
+
+    Raises:
+        InputError: lengths differ or no pose is known.
     """
     check_lengths(recording.time, recording.activity)
     path = truth_in_sheet(recording)

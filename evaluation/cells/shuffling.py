@@ -33,18 +33,27 @@ _FEWEST = 19
 
 
 class PathBins(NamedTuple):
-    """The bin of each sample of a path: of place, of heading or of any other variable."""
+    """The bin of each sample of a path: of place, of heading or of any other variable.
 
-    flat: np.ndarray  # [T] int flat index into bins of `shape`, -1 for a sample that does not count
-    shape: tuple[int, ...]  # of the bins, (H, W) or (B,)
-    seconds: np.ndarray  # [T] s that each sample stands for
+    Attributes:
+        flat: [T] int flat index into bins of `shape`, -1 for a sample that does not count. shape: of the
+            bins, (H, W) or (B,). seconds: [T] s that each sample stands for.
+    """
+
+    flat: np.ndarray
+    shape: tuple[int, ...]
+    seconds: np.ndarray
 
 
 class ShuffledScores(NamedTuple):
-    """Scores of cells and of their shuffles."""
+    """Scores of cells and of their shuffles.
 
-    score: np.ndarray  # [C] of the cells as recorded, NaN where there is no score
-    shuffled: np.ndarray  # [S, C] of their shuffles, NaN where there is no score
+    Attributes:
+        score: [C] of the cells as recorded. shuffled: [S, C] of their shuffles. NaN where there is no score.
+    """
+
+    score: np.ndarray
+    shuffled: np.ndarray
 
     @property
     def percentile(self) -> np.ndarray:
@@ -74,14 +83,20 @@ class ShuffledScores(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """How often shuffled cells exceed the 95th percentile of their own shuffles."""
+    """How often shuffled cells exceed the 95th percentile of their own shuffles.
 
-    cells: int  # that have a score and a percentile
-    share: float  # of them above the percentile
-    tied: float  # share of them at it, as happens to a score of few values; it is missing in `share`
-    low: float  # of the binomial 95 % band of the share round 5 %
-    high: float  # of the same band
-    shuffled_mean: float  # mean score of all shuffles
+    Attributes:
+        cells: that have a score and a percentile. share: of them above the percentile. tied: share of them
+            at it, as happens to a score of few values; it is missing in `share`.
+        low, high: binomial 95 % band of the share round 5 %. shuffled_mean: mean score of all shuffles.
+    """
+
+    cells: int
+    share: float
+    tied: float
+    low: float
+    high: float
+    shuffled_mean: float
 
 
 def shuffled_scores(
@@ -124,6 +139,9 @@ def calibrate(
 
     Args:
         activity, bins, score, shuffles, seed: as in `shuffled_scores`.
+
+    Raises:
+        InputError: as in `shuffled_scores`.
     """
     _check_path(activity, bins)
     own = stream(seed, "calibration").integers(0, len(activity), (activity.shape[1],))

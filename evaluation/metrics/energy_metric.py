@@ -23,10 +23,14 @@ _RELATIONS = {name: () for name in ("t1", "t2", "x", "y", "z", "roll", "pitch", 
 
 
 class Energy(NamedTuple):
-    """The two parts of the energy, means over `pairs` pairs (NaN without pairs)."""
+    """The two parts of the energy, means over `pairs` pairs (NaN without pairs).
 
-    trans2: float  # mean squared translation error, m^2
-    rot2: float  # mean squared rotation error, rad^2
+    Attributes:
+        trans2: mean squared translation error, m^2. rot2: mean squared rotation error, rad^2.
+    """
+
+    trans2: float
+    rot2: float
     pairs: int
 
     @property
@@ -36,11 +40,15 @@ class Energy(NamedTuple):
 
 
 class Relations(NamedTuple):
-    """True relative motions between two times of a recording, as published with the benchmark."""
+    """True relative motions between two times of a recording, as published with the benchmark.
 
-    start: np.ndarray  # [P] s
-    end: np.ndarray  # [P] s
-    motion: np.ndarray  # [P, 3] pose at `end` relative to that at `start`, m, m, rad
+    Attributes:
+        start: [P] s. end: [P] s. motion: [P, 3] pose at `end` relative to that at `start`, m, m, rad.
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    motion: np.ndarray
 
 
 def successive_pairs(count: int, step: int = 1) -> np.ndarray:

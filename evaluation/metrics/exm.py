@@ -104,18 +104,28 @@ _OfEntries = Callable[[np.ndarray], np.ndarray]
 
 
 class ExperienceMetric(NamedTuple):
-    """ARR and ARCR of one run with their counts."""
+    """ARR and ARCR of one run with their counts.
 
-    arr: float  # re-localisations / entries after the base set; NaN without entries
-    arcr: float  # correct re-localisations / re-localisations; NaN without re-localisations
-    entries: int  # after the base set
-    relocalisations: int  # eta
-    correct: int  # eta_c
-    base: int  # entries in the base set, in the log used
-    note: str  # reason for NaN, or a warning ('' for none)
-    counted: np.ndarray  # [N] bool, the entry is a re-localisation
-    right: np.ndarray  # [N] bool, a correct one
-    near: np.ndarray  # [N] bool, true and perceived pose are within the thresholds (line 24; where `counted`)
+    Attributes:
+        arr: re-localisations / entries after the base set; NaN without entries.
+        arcr: correct re-localisations / re-localisations; NaN without re-localisations.
+        entries: after the base set. relocalisations: eta. correct: eta_c.
+        base: entries in the base set, in the log used.
+        note: reason for NaN, or a warning ('' for none).
+        counted, right: [N] bool, the entry is a re-localisation; a correct one.
+        near: [N] bool, true and perceived pose are within the thresholds (line 24; where `counted`).
+    """
+
+    arr: float
+    arcr: float
+    entries: int
+    relocalisations: int
+    correct: int
+    base: int
+    note: str
+    counted: np.ndarray
+    right: np.ndarray
+    near: np.ndarray
 
     @property
     def arcr_chain_free(self) -> float:

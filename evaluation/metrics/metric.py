@@ -17,11 +17,16 @@ Direction = Literal["low", "high"] | None
 class Quantity(Settings):
     """One measured value."""
 
-    label: str  # name in words
-    value: float | int | None  # the value; None (null in JSON) if undefined, with the reason in `note`
-    unit: str  # SI, or degrees as `deg`; '' for a ratio or a count
-    odometry: float | int | None = None  # the value for odometry, if defined
-    note: str = ""  # reason for a missing value, or a remark on the value
+    label: str
+    """Name in words."""
+    value: float | int | None
+    """The value; None (null in JSON) if undefined, with the reason in `note`."""
+    unit: str
+    """SI, or degrees as `deg`; '' for a ratio or a count."""
+    odometry: float | int | None = None
+    """The value for odometry, if defined."""
+    note: str = ""
+    """Reason for a missing value, or a remark on the value."""
 
     @staticmethod
     def pool(trials: Sequence[Quantity]) -> Quantity:
@@ -47,16 +52,20 @@ MISSING_TRUTH = Finding(np.nan, note="no ground truth")
 
 
 class Metric(NamedTuple):
-    """One metric."""
+    """One metric.
 
-    name: str  # key in `scorecard.json`
-    label: str  # in words
-    unit: str  # SI, `deg`, or ''
-    direction: Direction  # of better values
-    section: str  # heading in the table
+    Attributes:
+        name: key in `scorecard.json`. label: in words. unit: SI, `deg`, or ''. direction: of better values.
+        section: heading in the table. compute: the finding from a `RunData`; None without the ground truth
+            that it needs, and of quantities that are made otherwise.
+    """
+
+    name: str
+    label: str
+    unit: str
+    direction: Direction
+    section: str
     compute: Callable[[Any], Finding | None] = lambda _: None
-    """The finding from a `RunData`; None without the ground truth that it needs, and of quantities that are
-    made otherwise."""
 
     def quantity(self, finding: Finding) -> Quantity:
         """The value as written to a scorecard; NaN becomes None."""

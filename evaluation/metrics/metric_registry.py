@@ -13,10 +13,14 @@ from tactile.base.settings import Settings
 
 
 class MetricEntry(NamedTuple):
-    """A registered metric."""
+    """A registered metric.
 
-    config_class: type[Settings]  # its settings
-    build: Callable[[Any], Metric]  # makes the metric from these; its `compute` gets a `RunData`
+    Attributes:
+        config_class: its settings. build: makes the metric from these; its `compute` gets a `RunData`.
+    """
+
+    config_class: type[Settings]
+    build: Callable[[Any], Metric]
 
 
 METRICS: Registry[MetricEntry] = Registry("ratslam.metrics", "metric", MetricEntry, {})

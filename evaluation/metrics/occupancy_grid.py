@@ -17,11 +17,16 @@ _SKIN = 1 - 1e-6  # cells; gives walls on cell centres and on cell borders one l
 
 
 class OccupancyGrid(NamedTuple):
-    """An occupancy map."""
+    """An occupancy map.
 
-    probability: np.ndarray  # [H, W] in 0..1; row j counts y upwards, column i counts x
-    origin: np.ndarray  # [2] lower left corner of cell (0, 0), m
-    cell: float  # side length of a cell, m
+    Attributes:
+        probability: [H, W] in 0..1; row j counts y upwards, column i counts x.
+        origin: [2] lower left corner of cell (0, 0), m. cell: side length of a cell, m.
+    """
+
+    probability: np.ndarray
+    origin: np.ndarray
+    cell: float
 
     def check(self, truth: GridTruth | None = None) -> None:
         """Checks a map, and that it has the cells of its truth (ValueError)."""
@@ -41,12 +46,17 @@ class OccupancyGrid(NamedTuple):
 
 
 class GridTruth(NamedTuple):
-    """The true world, on the cells of a map and as segments."""
+    """The true world, on the cells of a map and as segments.
+
+    Attributes:
+        occupied: [H, W] bool, the cell's centre is inside an object or wall; undefined beyond the outer wall.
+        inside: [H, W] bool, within the outer wall. segments: [S, 4] surfaces of walls and objects,
+            x1, y1, x2, y2, m.
+    """
 
     occupied: np.ndarray
-    """[H, W] bool, the cell's centre is inside an object or wall; undefined beyond the outer wall."""
-    inside: np.ndarray  # [H, W] bool, within the outer wall
-    segments: np.ndarray  # [S, 4] surfaces of walls and objects, x1, y1, x2, y2, m
+    inside: np.ndarray
+    segments: np.ndarray
 
     def occupancy(self, wall: np.ndarray, outside: float = PRIOR_OCCUPANCY) -> np.ndarray:
         """The truth as occupancy [H, W] (Fox et al. 2012, Fig. 3): 1 in objects and `wall`, 0 in free space,
@@ -55,13 +65,18 @@ class GridTruth(NamedTuple):
 
 
 class TouchableSurface(NamedTuple):
-    """The part of the truth that can be touched from free space."""
+    """The part of the truth that can be touched from free space.
 
-    free: np.ndarray  # [H, W] bool, empty cells inside the arena
+    Attributes:
+        free: [H, W] bool, empty cells inside the arena.
+        wall: [H, W] bool, other cells whose centre is within one cell of a surface that faces a free cell:
+            the boundary of objects, and one ring around the arena even if its wall has no thickness.
+        points: [K, 2] points on those surfaces, m, one every `SURFACE_SPACING`.
+    """
+
+    free: np.ndarray
     wall: np.ndarray
-    """[H, W] bool, other cells whose centre is within one cell of a surface that faces a free cell: the
-    boundary of objects, and one ring around the arena even if its wall has no thickness."""
-    points: np.ndarray  # [K, 2] points on those surfaces, m, one every `SURFACE_SPACING`
+    points: np.ndarray
 
 
 def cell_centres(grid: OccupancyGrid) -> np.ndarray:

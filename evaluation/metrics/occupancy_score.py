@@ -41,8 +41,10 @@ _MASKS: tuple[CellMask, ...] = ("grid", "arena")
 class Convention(Settings):
     """One reading of equation 6."""
 
-    outside: float = PRIOR_OCCUPANCY  # truth outside the arena and its wall
-    mask: CellMask = "grid"  # cells of the mean
+    outside: float = PRIOR_OCCUPANCY
+    """Truth outside the arena and its wall."""
+    mask: CellMask = "grid"
+    """Cells of the mean."""
     smooth: bool = False
     """Whether the truth is smoothed; then a perfect map has an error, and a blurred one a smaller error."""
 
@@ -77,12 +79,19 @@ class GridError(Settings):
     """Equation 6 under one convention, of the map and of maps without exploration."""
 
     convention: Convention
-    error: float  # mean of |map - truth|; for several trials the mean of their errors
-    spread: float | None = None  # its standard deviation over trials; None for one
-    prior: float  # error of 0.3 in all cells
-    best: float  # error of the best constant, the median of the truth
-    coin: float  # expected error of a map of Bernoulli(0.5) cells: 0.5 for any truth (the paper prints 0.47)
-    skill: float | None  # 1 - error / best; None if the best constant has no error
+    """The convention."""
+    error: float
+    """Mean of |map - truth|; for several trials the mean of their errors."""
+    spread: float | None = None
+    """Its standard deviation over trials; None for one."""
+    prior: float
+    """Error of 0.3 in all cells."""
+    best: float
+    """Error of the best constant, the median of the truth."""
+    coin: float
+    """Expected error of a map of Bernoulli(0.5) cells: 0.5 for any truth (the paper prints 0.47)."""
+    skill: float | None
+    """1 - error / best; None if the best constant has no error."""
 
 
 def grid_error(
@@ -232,11 +241,14 @@ PAPER_ERRORS = {"blob": 0.40, "geometric": 0.39, "template": 0.37}
 class GridScore(Settings):
     """The score of one map, or the mean over several trials."""
 
-    name: str  # name of the mapper
-    trials: int = 1  # number of maps; every value is their mean
+    name: str
+    """Name of the mapper."""
+    trials: int = 1
+    """Number of maps; every value is their mean."""
     errors: tuple[GridError, ...]
     """Equation 6, in the order of `evaluation.metrics.occupancy_score.CONVENTIONS`."""
-    quantities: dict[str, Quantity]  # in the order of the table; an undefined value is None with a reason
+    quantities: dict[str, Quantity]
+    """In the order of the table; an undefined value is None with a reason."""
 
     def under(self, convention: Convention) -> GridError:
         """Equation 6 under one convention."""

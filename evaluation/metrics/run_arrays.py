@@ -16,30 +16,42 @@ UNFINISHED = "not judged before the end of the run"
 
 
 class RunArrays(NamedTuple):
-    """Poses, experiences and truth of a run with N steps, M experiences and L links."""
+    """Poses, experiences and truth of a run with N steps, M experiences and L links.
 
-    time: np.ndarray  # [N] s, increasing
-    truth: np.ndarray | None  # [N, 3] true poses (m, m, rad), NaN in rows without one; or None
-    online: np.ndarray  # [N, 3] online pose at each step
-    final: np.ndarray  # [N, 3] pose of each step in the final map
-    odometry: np.ndarray  # [N, 3] dead reckoning of raw odometry from any start
-    experience: np.ndarray  # [N] current experience, an index into `nodes`, -1 for none
-    created: np.ndarray  # [M] step at which each experience was first visited, -1: not in this run
-    nodes: np.ndarray  # [M, 3] poses of the experiences in the final map, in the frame of `final`
-    links: np.ndarray  # [L, 2] linked experiences
+    Attributes:
+        time: [N] s, increasing.
+        truth: [N, 3] true poses (m, m, rad), NaN in rows without one; or None.
+        online: [N, 3] online pose at each step. final: [N, 3] pose of each step in the final map.
+        odometry: [N, 3] dead reckoning of raw odometry from any start.
+        experience: [N] current experience, an index into `nodes`, -1 for none.
+        created: [M] step at which each experience was first visited, -1: not in this run.
+        nodes: [M, 3] poses of the experiences in the final map, in the frame of `final`.
+        links: [L, 2] linked experiences.
+        doubt: probability, by the map itself, that its error is worse than odometry's; NaN if there is none.
+        unjudged: why there is none. warnings: about the input, a sentence each.
+        online_error: [A] position errors of the current pose in the map of that time, m; empty if unknown.
+        piece: [N] the piece of the map in which each step is, see `evaluation.metrics.run_metrics`; empty:
+            all steps are in one.
+        node_piece: [M] the piece of each experience, which may have no steps; empty: that of its first visit.
+        state: [N] of a session localised in a map: found, searching, ... ; empty for others.
+    """
+
+    time: np.ndarray
+    truth: np.ndarray | None
+    online: np.ndarray
+    final: np.ndarray
+    odometry: np.ndarray
+    experience: np.ndarray
+    created: np.ndarray
+    nodes: np.ndarray
+    links: np.ndarray
     online_error: np.ndarray = np.zeros(0)
-    """[A] position errors of the current pose in the map of that time, m; empty if unknown."""
     doubt: float = np.nan
-    """Probability, by the map itself, that its error is worse than odometry's; NaN if there is none."""
-    unjudged: str = NOT_JUDGED  # why there is none
-    warnings: tuple[str, ...] = ()  # about the input, a sentence each
+    unjudged: str = NOT_JUDGED
+    warnings: tuple[str, ...] = ()
     piece: np.ndarray = np.zeros(0, int)
-    """[N] the piece of the map in which each step is, see `evaluation.metrics.run_metrics`; empty: all steps
-    are in one."""
     node_piece: np.ndarray = np.zeros(0, int)
-    """[M] the piece of each experience, which may have no steps; empty: that of its first visit."""
     state: np.ndarray = np.zeros(0, str)
-    """[N] of a session localised in a map: found, searching, ... ; empty for others."""
 
     @property
     def has_pieces(self) -> bool:

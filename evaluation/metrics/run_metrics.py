@@ -126,12 +126,17 @@ def unjoined_share(piece: np.ndarray) -> float:
 
 
 class RunData(NamedTuple):
-    """The input of run metrics."""
+    """The input of run metrics.
 
-    run: RunArrays  # as scored
-    exm: ExmConfig  # as scored
-    rows: np.ndarray  # [K] steps with a true pose
-    findings: dict[str, Finding]  # of `RUN_METRICS` by name, without those that need a missing truth
+    Attributes:
+        run, exm: as scored. rows: [K] steps with a true pose. findings: those of `RUN_METRICS` by name;
+            values that need a missing truth are left out.
+    """
+
+    run: RunArrays
+    exm: ExmConfig
+    rows: np.ndarray
+    findings: dict[str, Finding]
 
 
 def _metric(name: str, label: str, unit: str, direction: Direction, section: str) -> Metric:

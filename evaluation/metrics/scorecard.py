@@ -34,20 +34,27 @@ WORSE = 1.01
 class HealthCard(Settings):
     """How far input and map of a run can be believed, judged without truth."""
 
-    input: Literal["clean", "warned"] = "clean"  # one that is refused makes no run
-    warnings: tuple[str, ...] = ()  # about the input, a sentence each
+    input: Literal["clean", "warned"] = "clean"
+    """One that is refused makes no run."""
+    warnings: tuple[str, ...] = ()
+    """About the input, a sentence each."""
     worse_than_odometry: float | None = None
     """Probability that the map's error is worse than odometry's, whatever the input; None if unknown."""
-    reason: str = ""  # why it is None
+    reason: str = ""
+    """Why it is None."""
 
 
 class Scorecard(Settings):
     """All quantities of one run by name; `model_dump_json` gives `scorecard.json`."""
 
-    name: str  # name of the run
-    exm: ExmConfig  # thresholds and base set of the Experience Metric (all modes and kinds of log are scored)
-    quantities: dict[str, Quantity]  # in the order of the table
-    health: HealthCard | None = None  # of a run; None (null) for the log of another system
+    name: str
+    """Name of the run."""
+    exm: ExmConfig
+    """Thresholds and base set of the Experience Metric (all modes and kinds of log are scored)."""
+    quantities: dict[str, Quantity]
+    """In the order of the table."""
+    health: HealthCard | None = None
+    """Of a run; None (null) for the log of another system."""
 
     @property
     def position_error(self) -> Quantity:

@@ -24,15 +24,19 @@ _HEAD, _GAP, _BOTTOM = 0.48, 0.42, 1.0  # inches above a small map, between two,
 
 
 class GridPanel(NamedTuple):
-    """A map to draw."""
+    """A map to draw.
 
-    name: str  # title
-    line: str  # subtitle with its metrics
+    Attributes:
+        name: title. line: subtitle with its metrics. segments: [S, 4] true walls, m. paths: of a run, [T, 2]
+            or [T, 3] each, m: the true path, which may have NaN rows, online poses of the filter, and dead
+            reckoning.
+    """
+
+    name: str
+    line: str
     grid: OccupancyGrid
-    segments: np.ndarray = NO_SEGMENTS  # [S, 4] true walls, m
+    segments: np.ndarray = NO_SEGMENTS
     paths: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-    """Of a run, [T, 2] or [T, 3] each, m: the true path, which may have NaN rows, online poses of the filter,
-    and dead reckoning."""
 
 
 def draw_grid(panel: GridPanel) -> style.Figure:

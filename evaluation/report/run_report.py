@@ -45,31 +45,42 @@ SOURCES = {
 
 
 class RunReport(NamedTuple):
-    """A run of N steps."""
+    """A run of N steps.
+
+    Attributes:
+        backend, source: method, and kind of source; '' where the configuration cannot be read.
+        doubt: [N] probability at each step that the map is worse than odometry, NaN: not judged.
+        spread: [N] standard deviation of the position at each step, m. belief: [n, 3] probability of the
+            heaviest packet of the pose cells, of the second and of a new place, at the steps `belief_step`
+            [n]; n = 0 of methods whose pose cells hold no belief.
+        online_error: [k] errors of the current pose at times `online_time` [k] s.
+        cost: [k] computing times a step, s, after `cost_step` [k] steps.
+        run: its arrays, pieces of the map as `arrange_pieces` draws them.
+        layers: paths in the frame of the map, to which `layers.to_map` moves `walls`.
+        map_path: [N, 2] the path of a doubted map in that frame; None: `layers.final` is that of the map.
+        truth_lines: [S, 4] true walls of a grid's arena, m. grid: in the frame of the layers.
+    """
 
     name: str
     manifest: Manifest
-    backend: str  # method; '' where the configuration cannot be read
-    source: str  # kind of source; '' where the configuration cannot be read
-    run: RunArrays  # pieces of the map as `arrange_pieces` draws them
+    backend: str
+    source: str
+    run: RunArrays
     card: Scorecard
     verdict: Verdict
-    doubt: np.ndarray  # [N] probability at each step that the map is worse than odometry, NaN: not judged
-    spread: np.ndarray  # [N] standard deviation of the position at each step, m
+    doubt: np.ndarray
+    spread: np.ndarray
     belief: np.ndarray
-    """[n, 3] probability of the heaviest packet of the pose cells, of the second and of a new place; n = 0 of
-    methods whose pose cells hold no belief."""
-    belief_step: np.ndarray  # [n] its steps
-    online_time: np.ndarray  # [k] s
-    online_error: np.ndarray  # [k] errors of the current pose then
-    cost_step: np.ndarray  # [k] number of steps so far
-    cost: np.ndarray  # [k] computing times a step until then, s
-    layers: Layers  # paths in the frame of the map, to which `layers.to_map` moves `walls`
+    belief_step: np.ndarray
+    online_time: np.ndarray
+    online_error: np.ndarray
+    cost_step: np.ndarray
+    cost: np.ndarray
+    layers: Layers
     map_path: np.ndarray | None
-    """[N, 2] the path of a doubted map in that frame; None: `layers.final` is that of the map."""
     walls: np.ndarray
-    truth_lines: np.ndarray  # [S, 4] true walls of a grid's arena, m
-    grid: OccupancyGrid | None  # in the frame of the layers
+    truth_lines: np.ndarray
+    grid: OccupancyGrid | None
     grid_score: GridScore | None
     closures: ClosureTable
     views: ClosureViews | None

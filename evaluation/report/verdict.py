@@ -20,11 +20,15 @@ CAUTION = 1 - DOUBTED
 
 
 class Verdict(NamedTuple):
-    """Whether to believe a map."""
+    """Whether to believe a map.
+
+    Attributes:
+        level: its kind. headline: a few words. reason: a sentence.
+    """
 
     level: Literal["believed", "uncertain", "doubted", "unjudged"]
-    headline: str  # a few words
-    reason: str  # a sentence
+    headline: str
+    reason: str
 
 
 def judge_map(doubt: float, unjudged: str = NOT_JUDGED) -> Verdict:

@@ -93,33 +93,48 @@ HOME_RADIUS = 0.09
 
 
 class SessionResult(NamedTuple):
-    """The outcome of a session of T steps."""
+    """The outcome of a session of T steps.
 
-    truth: np.ndarray  # [T, 3] true poses
-    odometry: np.ndarray  # [T, 3] dead-reckoned poses
-    trajectory: np.ndarray  # [T, 3] final mapped poses
-    place: np.ndarray  # [T] current experience, -1 for none
-    node: np.ndarray  # [M, 3] poses of the experiences in the final map
-    closures: np.ndarray  # [K, 2] later and earlier step of each loop closure
-    live: np.ndarray  # [T, 3] pose given at each step, in the map of that time
-    piece: np.ndarray  # [T] piece of the map of each step
+    Attributes:
+        truth, odometry, trajectory: [T, 3] true, dead-reckoned and final mapped poses. place: [T] current
+            experience, -1 for none. node: [M, 3] poses of the experiences in the final map.
+        closures: [K, 2] later and earlier step of each loop closure. live: [T, 3] pose given at each step, in
+            the map of that time. piece: [T] piece of the map of each step.
+    """
+
+    truth: np.ndarray
+    odometry: np.ndarray
+    trajectory: np.ndarray
+    place: np.ndarray
+    node: np.ndarray
+    closures: np.ndarray
+    live: np.ndarray
+    piece: np.ndarray
 
 
 class TouchMetrics(NamedTuple):
-    """Metrics of one session; NaN where a metric is not defined."""
+    """Metrics of one session; NaN where a metric is not defined.
 
-    em: float  # Energy Metric over all pairs of steps of the final map, m^2 + rad^2
-    em_experiences: float  # the same with each step at the pose of its experience
-    em_odometry: float  # the same of dead reckoning
-    arr: float  # strict Experience Metric
-    arcr: float  # strict Experience Metric
+    Attributes:
+        em: Energy Metric over all pairs of steps of the final map, m^2 + rad^2. em_experiences: the same with
+            each step at the pose of its experience. em_odometry: the same of dead reckoning.
+        arr, arcr: strict Experience Metric. arcr_chain_free: share of the re-localisations within its
+            thresholds, whether or not earlier ones were correct.
+        relocalisations, closures: counts. false_closures: closures beyond `FALSE_CLOSURE_DISTANCE`.
+        experiences: in the map. steps: of the session.
+    """
+
+    em: float
+    em_experiences: float
+    em_odometry: float
+    arr: float
+    arcr: float
     arcr_chain_free: float
-    """Share of the re-localisations within its thresholds, whether or not earlier ones were correct."""
     relocalisations: int
     closures: int
-    false_closures: int  # closures beyond `FALSE_CLOSURE_DISTANCE`
-    experiences: int  # in the map
-    steps: int  # of the session
+    false_closures: int
+    experiences: int
+    steps: int
 
 
 def touch_metrics(result: SessionResult, exm: ExmConfig | None = None) -> TouchMetrics:
@@ -180,14 +195,18 @@ ROWS = 64
 
 
 class ViewDifferences(NamedTuple):
-    """Differences of pairs of views."""
+    """Differences of pairs of views.
 
-    edge: np.ndarray  # [BINS + 1] of the histograms
-    same: np.ndarray  # [BINS] pairs of views of one place
-    other: np.ndarray  # [BINS] pairs of views of two places
+    Attributes:
+        edge: [BINS + 1] of the histograms. same, other: [BINS] pairs of views of one place, of two places.
+        auc: probability that a pair of different places differs more than a pair of the same; 0.5: the views
+            do not separate places.
+    """
+
+    edge: np.ndarray
+    same: np.ndarray
+    other: np.ndarray
     auc: float
-    """Probability that a pair of different places differs more than a pair of the same; 0.5: the views do not
-    separate places."""
 
     def quantile(self, count: np.ndarray, share: float) -> float:
         """The difference below which this share of the pairs of a histogram [BINS] lies."""

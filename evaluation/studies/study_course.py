@@ -27,17 +27,24 @@ CELLS = 8
 
 
 class StudyCourse(NamedTuple):
-    """The course of T steps, and what its statistics need."""
+    """The course of T steps, and what its statistics need.
 
-    name: str  # of the source
-    config: NetworkConfig  # of the network
-    course: CellCourse  # input of the networks
-    expected: np.ndarray  # [T, 3] poses that the packet would have without drift, cells, not wrapped
-    bin: np.ndarray  # [T] flat place bin y * W + x of the true position
-    seconds: np.ndarray  # [T] duration of each step
-    x_edges: np.ndarray  # [W + 1] m
-    y_edges: np.ndarray  # [H + 1] m
-    chosen: np.ndarray  # [C] cells of the flattened network whose rate maps are made
+    Attributes:
+        name: of the source. config: of the network. course: input of the networks. expected: [T, 3] poses
+            that the packet would have without drift, cells, not wrapped. bin: [T] flat place bin y * W + x
+            of the true position. seconds: [T] duration of each step. x_edges: [W + 1] m. y_edges: [H + 1] m.
+            chosen: [C] cells of the flattened network whose rate maps are made.
+    """
+
+    name: str
+    config: NetworkConfig
+    course: CellCourse
+    expected: np.ndarray
+    bin: np.ndarray
+    seconds: np.ndarray
+    x_edges: np.ndarray
+    y_edges: np.ndarray
+    chosen: np.ndarray
 
 
 def read_course(

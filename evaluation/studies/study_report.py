@@ -147,12 +147,16 @@ _SIZE = 7.6  # of labels, points
 
 
 class ParetoPoint(NamedTuple):
-    """One configuration."""
+    """One configuration.
 
-    name: str  # its label
-    time: tuple[float, float, float]  # minimum, median, maximum over seeds
-    error: tuple[float, float, float]  # minimum, median, maximum over seeds
-    optimal: bool  # on the Pareto front
+    Attributes:
+        name: its label. time, error: (minimum, median, maximum) over seeds. optimal: on the Pareto front.
+    """
+
+    name: str
+    time: tuple[float, float, float]
+    error: tuple[float, float, float]
+    optimal: bool
 
 
 def draw_pareto(title: str, line: str, marks: Sequence[ParetoPoint], time: str, error: str) -> style.Figure:
