@@ -18,11 +18,11 @@ import numpy as np
 
 from evaluation.artifacts.manifest import RUNNING, read_manifest
 from evaluation.artifacts.run_reader import check_run_directory, checkpoint_steps, read_walls
-from evaluation.metrics.run_metrics import DOUBTED
+from evaluation.metrics.run_metrics import DOUBTED, path_length
 from evaluation.metrics.trajectory import align
 from evaluation.plots import style
 from evaluation.plots.map_plot import NO_WALLS, draw_walls, split_at_jumps
-from evaluation.plots.style import BLUE, GREY, LABEL_GREY, LINE_GREY, VERMILLION, WIDTH, YELLOW
+from evaluation.plots.style import BLUE, GREY, LABEL_GREY, LINE_GREY, VERMILLION, YELLOW
 from tactile.base.errors import InputError, os_errors_of
 from tactile.base.files import write_atomically
 from tactile.base.se2 import between, compose
@@ -67,6 +67,11 @@ class RunProgress(NamedTuple):
     warnings: tuple[str, ...] = ()
 
     @property
+    def length(self) -> float:
+        """Length of the path by odometry from the start of the run, m."""
+        return path_length(np.concatenate([np.zeros((1, 3)), self.odometry]))
+
+    @property
     def step_count(self) -> str:
         """Number of steps as text."""
         count = len(self.path)
@@ -74,7 +79,7 @@ class RunProgress(NamedTuple):
 
     def status_line(self, pace: float | None) -> str:
         """The state of a run in one line; `pace` is in steps per second."""
-        parts = [f"{self.name}: {self.status}", self.step_count, f"{path_length(self.odometry):.1f} m"]
+        parts = [f"{self.name}: {self.status}", self.step_count, f"{self.length:.1f} m"]
         parts += [] if pace is None else [f"{pace:.0f} steps/s"]
         parts += [] if self.online_error is None else [f"error {self.online_error:.3g} m"]
         parts += [
@@ -282,12 +287,7 @@ def watch_run(
         time.sleep(max(every, REST_FACTOR * (time.monotonic() - began)))
 
 
-def path_length(odometry: np.ndarray) -> float:
-    """Length of the path by odometry [N, 3] from the start of the run, m."""
-    return float(np.hypot(*np.diff(odometry[:, :2], axis=0, prepend=np.zeros((1, 2))).T).sum())
-
-
-_HEIGHT, _BOTTOM, _COUNTS = 6.4, 0.95, 1.55  # inches: total height, below the map, and width of the counts
+_TALL, _BOTTOM, _COUNTS = 4.55, 0.95, 1.55  # inches: height of the map, below it, and width of the counts
 _DRAWN = 5000  # steps drawn of a long path, to limit the drawing time
 _ROUND = 2 * np.pi * np.arange(49) / 48
 
@@ -306,15 +306,13 @@ def draw_watch(seen: RunProgress, walls: np.ndarray = NO_WALLS) -> style.Figure:
         x, y, turn = seen.sd
         parts.append(f"last pose ± {x:.2g} m, {y:.2g} m, {np.degrees(turn):.2g} degrees")
     parts += [] if seen.online_error is None else [f"error {seen.online_error:.3g} m"]
-    figure = style.new_figure(_HEIGHT, seen.name, "  ·  ".join(parts))
-    inner = WIDTH - style.LEFT - style.RIGHT - _COUNTS
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
+    figure, axes = style.new_chart(_TALL, _BOTTOM, seen.name, "  ·  ".join(parts), right=_COUNTS)
     axes.set_aspect("equal", adjustable="datalim")
     if len(seen.path):
         _paint(axes, seen, walls)
     axes.apply_aspect()
     style.metre_grid(axes, style.TRUTH if np.isfinite(seen.truth).any() else style.MAP)
-    _paint_counts(figure, seen, style.LEFT + inner + 0.25)
+    _paint_counts(figure, seen, style.LEFT + style.INNER - _COUNTS + 0.25)
     if len(seen.path):
         style.add_legend(figure, axes)
     return figure
@@ -352,7 +350,7 @@ def _paint_counts(figure: style.Figure, seen: RunProgress, left: float) -> None:
     counts += [("lost", seen.lost)] if seen.lost else []
     steps = max(1, len(seen.path))
     for row, (name, count) in enumerate(counts):
-        low = _HEIGHT - style.TOP - 0.45 * (row + 1)
+        low = _BOTTOM + _TALL - 0.45 * (row + 1)
         bar = style.add_axes(figure, left, low, _COUNTS - 0.3, 0.1)
         bar.barh([0, 0], [1, count / steps], color=[LINE_GREY, GREY if name == "ok" else BLUE])
         bar.set(xlim=(0, 1), ylim=(-0.4, 0.4), xticks=[], yticks=[])

@@ -30,7 +30,7 @@ def write_pieces(path: Path, time: np.ndarray, piece: np.ndarray) -> None:
     Path(path).write_text("\n".join([",".join(PIECE_COLUMNS), *lines]) + "\n", encoding="utf-8")
 
 
-def read_pieces(path: Path, steps: int) -> np.ndarray:
+def _read_pieces(path: Path, steps: int) -> np.ndarray:
     """The piece [steps] of each step, 0 without the file.
 
     Raises:
@@ -95,7 +95,7 @@ def read_run(path: Path) -> RunArrays:
     _refuse_merged(path)
     online_time, online = _tum(path / "online.tum")
     odometry_time, odometry = _tum(path / "odometry.tum")
-    place = read_column(path / "steps.csv", "place").astype(int)
+    place = read_columns(path / "steps.csv", "place")[0].astype(int)
     steps = min(len(online_time), len(odometry_time), len(place))
     if steps == 0:
         raise InputError(str(path), "a run without steps", "a run directory with results")
@@ -134,11 +134,11 @@ def read_run(path: Path) -> RunArrays:
         created=created,
         nodes=nodes,
         links=links,
-        online_error=read_column(errors, "error") if errors.exists() else np.zeros(0),
+        online_error=read_columns(errors, "error")[0] if errors.exists() else np.zeros(0),
         doubt=doubt,
         unjudged=unjudged,
         warnings=read_manifest(path).warnings,
-        piece=read_pieces(path / PIECES, steps),
+        piece=_read_pieces(path / PIECES, steps),
         node_piece=node_piece,
         state=_states(path / "localisation.csv", steps),
     )
@@ -211,26 +211,30 @@ def checkpoint_steps(path: Path) -> int:
         return 0
 
 
-def read_column(path: Path, name: str, empty: float | None = None) -> np.ndarray:
-    """A numeric column of a growing CSV file of a run; an incomplete last line is dropped.
+def read_columns(path: Path, *names: str, empty: float | None = None) -> list[np.ndarray]:
+    """Numeric columns of a growing CSV file of a run; an incomplete last line is dropped.
 
     Args:
         empty: value of an empty cell; None: an empty cell is an error.
 
     Raises:
-        InputError: the file is missing, or a row has no number in that column.
+        InputError: the file is missing, or a row has no number in one of the columns.
     """
-    text = read_text(path, "a file of a run directory")
-    header, *lines = text[: text.rfind("\n") + 1].splitlines() or [name]
-    try:
-        column = header.split(",").index(name)
-        cells = [line.split(",")[column] for line in lines]
-        found = np.array([empty if empty is not None and cell == "" else float(cell) for cell in cells])
-        if ((np.abs(found) > LARGEST) & np.isfinite(found)).any():
-            raise ValueError
-        return found
-    except (ValueError, IndexError):
-        raise InputError(str(path), f"a row without a number in column {name}", f"column {name}") from None
+    text, found = read_text(path, "a file of a run directory"), []
+    header, *lines = text[: text.rfind("\n") + 1].splitlines() or [",".join(names)]
+    fields, rows = header.split(","), [line.split(",") for line in lines]
+    for name in names:
+        try:
+            at = fields.index(name)
+            cells = [row[at] for row in rows]
+            column = np.array([empty if empty is not None and cell == "" else float(cell) for cell in cells])
+            if ((np.abs(column) > LARGEST) & np.isfinite(column)).any():
+                raise ValueError
+        except (ValueError, IndexError):
+            cause = f"a row without a number in column {name}"
+            raise InputError(str(path), cause, f"column {name}") from None
+        found.append(column)
+    return found
 
 
 def _tum(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """All scores of cells: a table with one row for each cell.
 
-Activity has no unit: that of all cells sums to 1. `AnalysisSettings.gain` turns it into spikes/s; without
-one, a cell with the mean activity of the network fires at 1 Hz. Scores in bits/spike and lengths do not
+Activity has no unit: that of all cells sums to 1. A `gain` turns it into spikes/s; without one, a cell with
+the mean activity of the network fires at 1 Hz. Scores in bits/spike and lengths do not
 depend on it; rates, bits/s and the Rayleigh test do.
 """
 
@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from evaluation.cells.fields import FieldSettings, border_score, find_fields
+from evaluation.cells.fields import border_score, find_fields
 from evaluation.cells.head_direction import (
     mean_vector_length,
     peak_rate,
@@ -24,29 +23,9 @@ from evaluation.cells.head_direction import (
     rayleigh_z,
 )
 from evaluation.cells.information import information, information_rate, mean_rate, selectivity, sparsity
-from evaluation.cells.rate_map import (
-    MapSettings,
-    arena_edges,
-    bin_activity,
-    coherence,
-    rate_maps,
-    tuning_curves,
-)
-from evaluation.cells.recording import BinnedSums, CellRecording
-from tactile.base.errors import InputError
+from evaluation.cells.rate_map import coherence, rate_maps, recorded_sums, tuning_curves
+from evaluation.cells.recording import CellRecording
 from tactile.base.files import write_atomically
-from tactile.base.settings import Settings
-
-
-class AnalysisSettings(Settings):
-    """How recorded cells are scored."""
-
-    maps: MapSettings = MapSettings()
-    """Bins and smoothing; the bins of sums are those of the recording."""
-    fields: FieldSettings = FieldSettings()
-    """What counts as a field."""
-    gain: float | None = Field(default=None, gt=0)
-    """Spikes/s for each unit of activity; None: the number of cells of the network."""
 
 
 class CellScores(NamedTuple):
@@ -85,46 +64,20 @@ class CellScores(NamedTuple):
     conjunctive: np.ndarray
 
 
-def analyse_cells(recording: CellRecording, settings: AnalysisSettings | None = None) -> CellScores:
-    """Scores of the chosen cells, from their time series, in bins over the box that the path fills.
+def analyse_cells(recording: CellRecording, gain: float | None = None) -> CellScores:
+    """Scores of the cells of `recorded_sums`: of the chosen ones or, if only sums were recorded, of all.
+
+    Args:
+        gain: spikes/s for each unit of activity; None: the number of cells of the network.
 
     Raises:
-        InputError: no cells were chosen, lengths differ, no pose is known or the path has no area.
+        InputError: no cells were recorded, lengths differ, no pose is known, the path has no area, or nothing
+            was visited.
     """
-    settings = settings or AnalysisSettings()
-    if len(recording.cell) == 0 or recording.activity.shape[1:] != recording.cell.shape:
-        found = f"activity of {recording.activity.shape} for {len(recording.cell)} cells"
-        raise InputError("recording", found, "one column for each chosen cell", "choose cells to record")
-    edges = arena_edges(recording.truth, settings.maps.place_bins)
-    sums = bin_activity(
-        recording.time, recording.truth, recording.activity, *edges, settings.maps.heading_bins
-    )
-    return _score_sums(sums, recording.cell, recording, settings)
-
-
-def analyse_all_cells(recording: CellRecording, settings: AnalysisSettings | None = None) -> CellScores:
-    """Scores of all cells of the network, from the sums of the recording.
-
-    Raises:
-        InputError: the recording has no sums, or nothing was visited.
-    """
-    cells = math.prod(recording.shape)
-    if recording.sums is None or len(recording.sums.place) != cells:
-        raise InputError("recording.sums", "not of all cells", f"sums of {cells} cells", "record the sums")
-    return _score_sums(recording.sums, np.arange(cells), recording, settings or AnalysisSettings())
-
-
-def _score_sums(
-    sums: BinnedSums, cell: np.ndarray, recording: CellRecording, settings: AnalysisSettings
-) -> CellScores:
-    """Scores of `cell` [n], indices in the network of the recording, from their sums."""
-    hz, maps = settings.gain or math.prod(recording.shape), settings.maps
-    rates = rate_maps(sums, maps.smoothing, maps.least_seconds) * hz
-    raw = rate_maps(sums, 0.0, maps.least_seconds)
-    curves = tuning_curves(sums, maps.heading_smoothing, maps.least_seconds) * hz
+    (sums, cell), hz = recorded_sums(recording), gain or math.prod(recording.shape)
+    rates, curves = rate_maps(sums) * hz, tuning_curves(sums) * hz
     place, turn = (rates, sums.seconds), (curves, sums.heading_seconds)
-    fields = find_fields(rates, settings.fields.share, settings.fields.least_bins)
-    about_place, about_heading = information(*place), information(*turn)
+    fields, about_place, about_heading = find_fields(rates), information(*place), information(*turn)
     heading, row, column = np.unravel_index(cell, recording.shape)
     bin_area = float((sums.x_edges[1] - sums.x_edges[0]) * (sums.y_edges[1] - sums.y_edges[0]))
     return CellScores(
@@ -138,7 +91,7 @@ def _score_sums(
         information_rate=information_rate(*place),
         sparsity=sparsity(*place),
         selectivity=selectivity(*place),
-        coherence=coherence(raw, sums.seconds),
+        coherence=coherence(rate_maps(sums, 0.0), sums.seconds),
         fields=fields.number,
         field_area=fields.largest * bin_area,
         border=border_score(*place),

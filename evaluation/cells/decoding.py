@@ -6,7 +6,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from evaluation.cells.rate_map import (
     BoxSamples,
@@ -21,24 +20,6 @@ from evaluation.cells.recording import CellRecording
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose
-from tactile.base.settings import Settings
-
-
-class DecodingSettings(Settings):
-    """How position is decoded."""
-
-    window: float = Field(default=0.5, gt=0)
-    """Time over which activity is averaged, s."""
-    block: float = Field(default=20.0, gt=0)
-    """Time of the blocks that by turns make the maps and test them, s."""
-    place_bins: int = Field(default=20, ge=3)
-    """Bins along each side of the box."""
-    smoothing: float = Field(default=1.5, ge=0)
-    """Standard deviation of the Gaussian over the maps, bins."""
-    least_seconds: float = Field(default=0.1, gt=0)
-    """A bin visited for less time in a half is never decoded from its maps, s."""
-    shifts: int = Field(default=100, ge=1)
-    """Circular shifts of the control."""
 
 
 class Decoding(NamedTuple):
@@ -58,7 +39,14 @@ class Decoding(NamedTuple):
 
 
 def decode_positions(
-    recording: CellRecording, settings: DecodingSettings | None = None, seed: int = 0
+    recording: CellRecording,
+    *,
+    window: float = 0.5,
+    block: float = 20.0,
+    bins: int = 20,
+    smoothing: float = 1.5,
+    shifts: int = 100,
+    seed: int = 0,
 ) -> Decoding:
     """Decodes the position of the rat from the chosen cells (Zhang et al. 1998: Bayes, independent Poisson
     cells, flat prior), cross-validated: odd blocks of time with the maps of the even ones and the other way
@@ -68,24 +56,28 @@ def decode_positions(
     rate is needed; activity is decoded without the noise of spikes. Control: the decoded positions, shifted
     round the session by at least a tenth of it against the true ones.
 
+    Args:
+        window: time over which activity is averaged, s. block: time of the blocks that by turns make the maps
+            and test them, s; a place visited too shortly in the one half is never decoded in the other.
+            bins: along each side of the box. smoothing: of the maps, bins. shifts: of the control.
+
     Raises:
         InputError: lengths differ, no pose is known, the path has no area or is shorter than four blocks.
     """
-    settings = settings or DecodingSettings()
-    x_edges, y_edges = arena_edges(recording.truth, settings.place_bins)
-    samples = box_samples(recording.time, recording.truth, recording.activity, x_edges, y_edges, 1)
-    block = ((samples.time - samples.time[0]) // settings.block).astype(int)
-    if block[-1] < 3:
+    edges = arena_edges(recording.truth, bins)
+    samples = box_samples(recording.time, recording.truth, recording.activity, *edges, 1)
+    number = ((samples.time - samples.time[0]) // block).astype(int)
+    if number[-1] < 3:
         raise InputError(
-            "recording", f"{samples.time[-1] - samples.time[0]:.1f} s", f"four blocks of {settings.block} s"
+            "recording", f"{samples.time[-1] - samples.time[0]:.1f} s", f"four blocks of {block} s"
         )
-    halves = [_decode_half(samples, block % 2 == half, (x_edges, y_edges), settings) for half in (0, 1)]
+    halves = [_decode_half(samples, number % 2 == half, edges, window, smoothing) for half in (0, 1)]
     time, truth, decoded = (np.concatenate(parts) for parts in zip(*halves, strict=True))
     order = np.argsort(time, kind="stable")
     time, truth, decoded = time[order], truth[order], decoded[order]
     error = np.linalg.norm(decoded - truth, axis=1)
     least = max(len(truth) // 10, 1)
-    by = stream(seed, "decoding control").integers(least, len(truth) - least + 1, settings.shifts)
+    by = stream(seed, "decoding control").integers(least, len(truth) - least + 1, shifts)
     control = np.array([np.median(np.linalg.norm(np.roll(decoded, k, axis=0) - truth, axis=1)) for k in by])
     return Decoding(time, truth, decoded, error, float(np.median(error)), control)
 
@@ -116,20 +108,25 @@ def log_posterior(
 
 
 def _decode_half(
-    samples: BoxSamples, train: np.ndarray, edges: tuple[np.ndarray, np.ndarray], settings: DecodingSettings
+    samples: BoxSamples,
+    train: np.ndarray,
+    edges: tuple[np.ndarray, np.ndarray],
+    seconds: float,
+    smoothing: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times [M] s, true and decoded places [M, 2] m of the windows outside `train` [samples] bool."""
+    """Times [M] s, true and decoded places [M, 2] m of the windows of `seconds` outside `train` [samples]
+    bool."""
     maps = sum_samples(BoxSamples(*(each[train] for each in samples)), *edges, 1)
-    rates = rate_maps(maps, settings.smoothing, settings.least_seconds)
+    rates = rate_maps(maps, smoothing)
     test = BoxSamples(*(each[~train] for each in samples))
-    _, window = np.unique((test.time - samples.time[0]) // settings.window, return_inverse=True)
-    seconds = np.bincount(window, test.seconds)
+    _, window = np.unique((test.time - samples.time[0]) // seconds, return_inverse=True)
+    spent = np.bincount(window, test.seconds)
     counts = _sum_windows(window, test.activity * test.seconds[:, None])
     time, truth = (
         _sum_windows(window, each) / np.bincount(window)[:, None]
         for each in (test.time[:, None], test.position)
     )
-    posterior = log_posterior(counts, seconds, rates, np.zeros(rates.shape[1:]))
+    posterior = log_posterior(counts, spent, rates, np.zeros(rates.shape[1:]))
     row, column = np.divmod(posterior.reshape(len(counts), -1).argmax(axis=1), rates.shape[2])
     x, y = ((each[1:] + each[:-1]) / 2 for each in edges)
     return time[:, 0], truth, np.stack([x[column], y[row]], axis=1)
@@ -140,17 +137,9 @@ def _sum_windows(window: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.add.reduceat(values, np.flatnonzero(np.diff(window, prepend=-1)), axis=0)
 
 
-class Drift(NamedTuple):
-    """time: [T] s. error: [T, 3] drift along the x and y of the sheet and in heading, m, m, rad; NaN where
-    the true pose is unknown."""
-
-    time: np.ndarray
-    error: np.ndarray
-
-
-def packet_drift(recording: CellRecording) -> Drift:
-    """Decoded minus true pose, 0 at the first known pose (drift of path integration as in Burak & Fiete
-    2009).
+def packet_drift(recording: CellRecording) -> np.ndarray:
+    """[T, 3] decoded minus true pose along the x and y of the sheet and in heading, m, m, rad: 0 at the first
+    known pose, NaN where the true pose is unknown (drift of path integration as in Burak & Fiete 2009).
 
     The sheet has its own origin and axes, so the true path is moved such that its first known pose is the
     packet's. The torus tells a pose only up to its sides; the error is unwrapped over time: between
@@ -168,7 +157,7 @@ def packet_drift(recording: CellRecording) -> Drift:
         [np.unwrap(wrapped[known, i], period=side) for i, side in enumerate(recording.torus_sides)], axis=1
     )
     error[known] -= error[known[0]]
-    return Drift(np.asarray(recording.time), error)
+    return error
 
 
 def truth_in_sheet(recording: CellRecording) -> np.ndarray:

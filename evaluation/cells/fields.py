@@ -5,20 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 from scipy.ndimage import label
 
 from tactile.base.errors import InputError
-from tactile.base.settings import Settings
-
-
-class FieldSettings(Settings):
-    """What counts as a field."""
-
-    share: float = Field(default=0.2, gt=0, le=1)
-    """Lowest rate in a field over the highest of the map."""
-    least_bins: int = Field(default=9, ge=1)
-    """Smaller fields do not count, bins."""
 
 
 class Fields(NamedTuple):

@@ -71,8 +71,9 @@ def conjunctive_information(rates: np.ndarray, seconds: np.ndarray) -> np.ndarra
     """[n] the smaller of the information of the place map and of the tuning curve that a joint map contains,
     bits per unit of activity (Skaggs et al. 1993, each).
 
-    It asks of any cell in one number what `exceeds_both` asks of grid cells; 0 for a cell that is flat over
-    place or over heading. It takes the joint map because a shuffle must shift place and heading together.
+    It asks of any cell in one number what Sargolini et al. 2006 ask of grid cells: that grid score and mean
+    vector length both lie above the 95th percentile of shuffles; 0 for a cell that is flat over place or over
+    heading. It takes the joint map because a shuffle must shift place and heading together.
     The information of a joint map beyond the two fails its control: a path fills 800 joint bins so thinly
     that shuffled cells have more of it than cells that are tuned to both.
 
@@ -84,19 +85,3 @@ def conjunctive_information(rates: np.ndarray, seconds: np.ndarray) -> np.ndarra
         time = seconds.sum(axis=tuple(axis - 1 for axis in axes))
         found.append(information(sums.sum(axis=axes) / np.where(time > 0, time, np.nan), time))
     return np.minimum(*found)
-
-
-def exceeds_both(
-    grid: np.ndarray,
-    vector: np.ndarray,
-    grid_threshold: np.ndarray | float,
-    vector_threshold: np.ndarray | float,
-) -> np.ndarray:
-    """[n] bool, conjunctive cells of Sargolini et al. 2006: grid score and mean vector length both lie above
-    the 95th percentile of shuffles.
-
-    Args:
-        grid: [n] grid scores. vector: [n] mean vector lengths. grid_threshold, vector_threshold: the 95th
-            percentile of their shuffles, of each cell [n] or of all.
-    """
-    return (grid > grid_threshold) & (vector > vector_threshold)

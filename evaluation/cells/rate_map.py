@@ -13,27 +13,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 from scipy.sparse import csr_array
 
-from evaluation.cells.recording import BinnedSums
+from evaluation.cells.recording import BinnedSums, CellRecording
 from tactile.base.errors import InputError
-from tactile.base.settings import Settings
-
-
-class MapSettings(Settings):
-    """Bins and smoothing of rate maps and tuning curves."""
-
-    place_bins: int = Field(default=20, ge=3)
-    """Bins along each side of the box."""
-    heading_bins: int = Field(default=36, ge=3)
-    """Bins of the heading; bin b is centred on 2 pi b / heading_bins rad."""
-    smoothing: float = Field(default=1.5, ge=0)
-    """Standard deviation of the Gaussian over place, bins."""
-    heading_smoothing: float = Field(default=0.0, ge=0)
-    """Standard deviation of the Gaussian over heading, bins."""
-    least_seconds: float = Field(default=0.1, gt=0)
-    """A bin visited for less time has no rate (NaN), s."""
 
 
 def rate_maps(sums: BinnedSums, smoothing: float = 1.5, least_seconds: float = 0.1) -> np.ndarray:
@@ -126,6 +109,25 @@ def bin_activity(
     `box_samples`."""
     samples = box_samples(time, truth, activity, x_edges, y_edges, heading_bins)
     return sum_samples(samples, x_edges, y_edges, heading_bins)
+
+
+def recorded_sums(recording: CellRecording) -> tuple[BinnedSums, np.ndarray]:
+    """The sums of n recorded cells and their indices [n] in the network: of the chosen ones, in bins over the
+    box that the path fills, or, if only sums were recorded, of all.
+
+    Raises:
+        InputError: no cells were recorded, lengths differ, no pose is known or the path has no area.
+    """
+    sums, cell = recording.sums, recording.cell
+    if sums is not None and len(cell) == 0:
+        return sums, np.arange(len(sums.place))
+    if len(cell) == 0:
+        raise InputError("recording", "no cells", "chosen cells or sums", "set cells.chosen or cells.sums")
+    if recording.activity.shape[1:] != cell.shape:
+        found = f"activity of {recording.activity.shape} for {len(cell)} cells"
+        raise InputError("recording", found, "one column for each chosen cell")
+    edges = arena_edges(recording.truth)
+    return bin_activity(recording.time, recording.truth, recording.activity, *edges), np.asarray(cell)
 
 
 def box_samples(

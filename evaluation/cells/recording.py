@@ -106,21 +106,10 @@ def read_recording(path: str | Path) -> CellRecording:
     ) -> CellRecording:
         if kind.shape or str(kind) != FORMAT:
             raise ValueError(f"the format {str(kind)[:40]!r}")
-        time, truth, packet, energy, place, cell, activity = arrays[: len(own) - 2]
         sums = BinnedSums(*arrays[len(own) - 2 :])
         heading, y, x = (int(count) for count in shape)
-        made = CellRecording(
-            (heading, y, x),
-            float(cell_size),
-            time,
-            truth,
-            packet,
-            energy,
-            place,
-            cell,
-            activity,
-            sums if sums.x_edges.size else None,
-        )
+        steps = (*arrays[: len(own) - 2], sums if sums.x_edges.size else None)
+        made = CellRecording((heading, y, x), float(cell_size), *steps)  # type: ignore[arg-type]
         _check(made)
         return made
 

@@ -100,6 +100,7 @@ class ExmConfig(Settings):
 
 
 DEFAULT_EXM = ExmConfig()
+_OfEntries = Callable[[np.ndarray], np.ndarray]
 
 
 class ExperienceMetric(NamedTuple):
@@ -108,10 +109,10 @@ class ExperienceMetric(NamedTuple):
     Attributes:
         arr: re-localisations / entries after the base set; NaN without entries.
         arcr: correct re-localisations / re-localisations; NaN without re-localisations.
-        entries: entries after the base set. relocalisations: eta. correct: eta_c.
+        entries: after the base set. relocalisations: eta. correct: eta_c.
         base: entries in the base set, in the log used.
-        mode, log: as in `ExmConfig`. note: reason for NaN, or a warning ('' for none).
-        counted: [N] bool, the entry is a re-localisation. right: [N] bool, a correct one.
+        note: reason for NaN, or a warning ('' for none).
+        counted, right: [N] bool, the entry is a re-localisation; a correct one.
         near: [N] bool, true and perceived pose are within the thresholds (line 24; where `counted`).
     """
 
@@ -121,8 +122,6 @@ class ExperienceMetric(NamedTuple):
     relocalisations: int
     correct: int
     base: int
-    mode: ExmMode
-    log: str
     note: str
     counted: np.ndarray
     right: np.ndarray
@@ -135,23 +134,6 @@ class ExperienceMetric(NamedTuple):
         NaN without re-localisations.
         """
         return float(self.near[self.counted].mean()) if self.counted.any() else np.nan
-
-
-class _Reading(NamedTuple):
-    """The parts of the listing that differ between modes.
-
-    Attributes:
-        perceived: ids [N] -> [N], the entry whose true pose an entry is compared with (lines 18 to 21).
-        turn: heading difference -> the angle that is compared (line 23).
-        correct: (line 24 holds, this is a dwell step, verdict on the entry before) -> verdict (line 26).
-        back: 1 if the experience of the entry before becomes valid, 0 if that of this entry does when it is
-            new (lines 34 to 37).
-    """
-
-    perceived: Callable[[np.ndarray], np.ndarray]
-    turn: Callable[[np.ndarray], np.ndarray]
-    correct: Callable[[bool, bool, bool], bool]
-    back: int
 
 
 def experience_metric(
@@ -178,13 +160,13 @@ def experience_metric(
     end = base_end(truth, config.position, config.heading_deg) if config.base is None else config.base
     rows = change_rows(experience) if config.log == "action" else np.flatnonzero(experience != -1)
     base = int(np.searchsorted(rows, _check_base(end, len(experience))))
-    reading = _READINGS[config.mode]
+    perceived_by, turned, _, _ = _READINGS[config.mode]
     ids, poses = experience[rows], truth[rows]
     counted = relocalisations(ids, base)
     # Lines 16 to 24 without the valid set.
-    perceived = poses[reading.perceived(ids)]
+    perceived = poses[perceived_by(ids)]
     distance = np.hypot(*(poses - perceived)[:, :2].T)
-    turn = np.abs(reading.turn(poses[:, 2] - perceived[:, 2]))
+    turn = np.abs(turned(poses[:, 2] - perceived[:, 2]))
     near = (distance < config.position) & (turn < np.radians(config.heading_deg))
     right = _correct(ids, base, counted, near, config.mode)
     eta, eta_c, entries = int(counted.sum()), int(right.sum()), len(ids) - base
@@ -193,7 +175,7 @@ def experience_metric(
     note = "; ".join(notes + ([] if eta else [NO_RELOCALISATION]))
     arr, arcr = eta / entries if entries else np.nan, eta_c / eta if eta else np.nan
     counts = entries, eta, eta_c, base
-    return ExperienceMetric(arr, arcr, *counts, config.mode, config.log, note, counted, right, near)
+    return ExperienceMetric(arr, arcr, *counts, note, counted, right, near)
 
 
 def relocalisations(experience: np.ndarray, base: int) -> np.ndarray:
@@ -265,7 +247,7 @@ def _correct(ids: np.ndarray, base: int, counted: np.ndarray, near: np.ndarray, 
 
     One sequential pass, because a verdict determines which experiences are valid later.
     """
-    reading = _READINGS[mode]
+    _, _, correct, back = _READINGS[mode]
     ids_, dwell = ids.tolist(), _dwell(ids).tolist()
     novel = (creation_rows(ids) == np.arange(len(ids))).tolist()
     counted_, near_ = counted.tolist(), near.tolist()
@@ -274,17 +256,21 @@ def _correct(ids: np.ndarray, base: int, counted: np.ndarray, near: np.ndarray, 
     sound = True  # the listing's r_c: the last re-localisation was correct
     for i in range(base, len(ids_)):
         if counted_[i]:
-            sound = right[i] = reading.correct(near_[i] and ids_[i] in valid, dwell[i], right[i - 1])
-        if sound and (i > 0 if reading.back else novel[i]):
-            valid.add(ids_[i - reading.back])
+            sound = right[i] = correct(near_[i] and ids_[i] in valid, dwell[i], right[i - 1])
+        if sound and (i > 0 if back else novel[i]):
+            valid.add(ids_[i - back])
     return np.array(right, bool)
 
 
 # The listing tests membership in R_c, the experiences re-localised correctly so far. In a dwell this is read
 # as the verdict on the previous entry: if R_c only grew, one correct visit would make all later ones correct.
-_READINGS: dict[ExmMode, _Reading] = {
-    "strict": _Reading(creation_rows, wrap, lambda near, dwell, before: before if dwell else near, 0),
-    "paper": _Reading(_last_entry, wrap, lambda near, dwell, before: near and not (dwell and not before), 1),
-    "or": _Reading(_last_entry, wrap, lambda near, dwell, before: near or (dwell and before), 1),
-    "literal": _Reading(_last_entry, np.asarray, lambda near, dwell, before: near and dwell and before, 1),
+_READINGS: dict[ExmMode, tuple[_OfEntries, _OfEntries, Callable[[bool, bool, bool], bool], int]] = {
+    "strict": (creation_rows, wrap, lambda near, dwell, before: before if dwell else near, 0),
+    "paper": (_last_entry, wrap, lambda near, dwell, before: near and not (dwell and not before), 1),
+    "or": (_last_entry, wrap, lambda near, dwell, before: near or (dwell and before), 1),
+    "literal": (_last_entry, np.asarray, lambda near, dwell, before: near and dwell and before, 1),
 }
+"""The parts of the listing that differ between modes: ids [N] -> [N], the entry whose true pose an entry is
+compared with (lines 18 to 21); heading difference -> the angle that is compared (line 23); (line 24 holds,
+this is a dwell step, verdict on the entry before) -> verdict (line 26); 1 if the experience of the entry
+before becomes valid, 0 if that of this entry does when it is new (lines 34 to 37)."""

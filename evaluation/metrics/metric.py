@@ -55,10 +55,9 @@ class Metric(NamedTuple):
     """One metric.
 
     Attributes:
-        name: key in `scorecard.json`. label: in words. unit: SI, `deg`, or ''.
-        direction: of better values. section: heading in the table.
-        compute: the finding from a `RunData`, or from the findings of a map by name; None without the ground
-            truth that it needs.
+        name: key in `scorecard.json`. label: in words. unit: SI, `deg`, or ''. direction: of better values.
+        section: heading in the table. compute: the finding from a `RunData`; None without the ground truth
+            that it needs, and of quantities that are made otherwise.
     """
 
     name: str
@@ -66,7 +65,7 @@ class Metric(NamedTuple):
     unit: str
     direction: Direction
     section: str
-    compute: Callable[[Any], Finding | None]
+    compute: Callable[[Any], Finding | None] = lambda _: None
 
     def quantity(self, finding: Finding) -> Quantity:
         """The value as written to a scorecard; NaN becomes None."""

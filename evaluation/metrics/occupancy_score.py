@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
+from evaluation.metrics.metric import Finding, Metric, Quantity
 from evaluation.metrics.occupancy_grid import (
     PRIOR_OCCUPANCY,
     GridTruth,
@@ -115,10 +115,8 @@ def grid_error(
     )
 
 
-def pool_errors(errors: Sequence[GridError]) -> GridError:
+def _pool_errors(errors: Sequence[GridError]) -> GridError:
     """The mean of the errors of several trials, under the same convention."""
-    if len({error.convention for error in errors}) != 1:
-        raise ValueError("no errors, or errors under different conventions; expected one convention")
     every = [error.error for error in errors]
     error, best = _mean(every), _mean([each.best for each in errors])
     return GridError(
@@ -158,20 +156,16 @@ CLAMP = 1e-3
 _ROUNDING = 6  # decimals; closer probabilities tie
 
 
-def _metric(name: str, label: str, unit: str, direction: Direction) -> Metric:
-    return Metric(name, label, unit, direction, "Map", lambda findings: findings[name])
-
-
 GRID_METRICS: tuple[Metric, ...] = (
-    _metric("map_brier", "Brier score", "", "low"),
-    _metric("map_brier_skill", "Brier skill", "", "high"),
-    _metric("map_brier_skill_free", "  with free space alone", "", "high"),
-    _metric("map_log_loss", "log loss", "nat", "low"),
-    _metric("map_log_loss_constant", "  of the best constant", "nat", None),
-    _metric("map_auc", "wall AUC", "", "high"),
-    _metric("map_auc_free", "  with free space alone", "", "high"),
-    _metric("map_chamfer_map", "Chamfer, occupied cells to walls", "m", "low"),
-    _metric("map_chamfer_walls", "Chamfer, walls to occupied cells", "m", "low"),
+    Metric("map_brier", "Brier score", "", "low", "Map"),
+    Metric("map_brier_skill", "Brier skill", "", "high", "Map"),
+    Metric("map_brier_skill_free", "  with free space alone", "", "high", "Map"),
+    Metric("map_log_loss", "log loss", "nat", "low", "Map"),
+    Metric("map_log_loss_constant", "  of the best constant", "nat", None, "Map"),
+    Metric("map_auc", "wall AUC", "", "high", "Map"),
+    Metric("map_auc_free", "  with free space alone", "", "high", "Map"),
+    Metric("map_chamfer_map", "Chamfer, occupied cells to walls", "m", "low", "Map"),
+    Metric("map_chamfer_walls", "Chamfer, walls to occupied cells", "m", "low", "Map"),
 )
 """In the order of the table."""
 
@@ -188,11 +182,8 @@ def _cells(grid: OccupancyGrid, surface: TouchableSurface) -> dict[str, Finding]
         reason = f"the truth has no {'wall' if surface.free.any() else 'free space'}"
         names = [metric.name for metric in GRID_METRICS if "chamfer" not in metric.name]
         return dict.fromkeys(names, Finding(np.nan, note=reason))
-    driven, rate, clipped = (
-        np.minimum(ours, PRIOR_OCCUPANCY),
-        float(wall.mean()),
-        "the map clipped at its prior",
-    )
+    driven, clipped = np.minimum(ours, PRIOR_OCCUPANCY), "the map clipped at its prior"
+    rate = float(wall.mean())
     blind, loss = rate * (1 - rate), _log_loss(np.full(len(wall), rate), wall)
     return {
         "map_brier": Finding(_brier(ours, wall), note=f"best constant, {rate:.3g}: {blind:.4g}"),
@@ -285,7 +276,7 @@ def pool_grids(scores: Sequence[GridScore], name: str) -> GridScore:
     return GridScore(
         name=name,
         trials=len(scores),
-        errors=tuple(pool_errors(each) for each in zip(*(score.errors for score in scores), strict=True)),
+        errors=tuple(_pool_errors(each) for each in zip(*(score.errors for score in scores), strict=True)),
         quantities={
             metric.name: Quantity.pool([score.quantities[metric.name] for score in scores])
             for metric in GRID_METRICS

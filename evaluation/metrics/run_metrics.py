@@ -101,7 +101,7 @@ def arrange_pieces(run: RunArrays) -> RunArrays:
     return run._replace(final=final, online=online, nodes=nodes, node_piece=of_node)
 
 
-def tie_jump(poses: np.ndarray, odometry: np.ndarray) -> tuple[int, float] | None:
+def _tie_jump(poses: np.ndarray, odometry: np.ndarray) -> tuple[int, float] | None:
     """The step at which online poses jump farther than a correction within a piece could move them, and how
     far, m; None without one. A piece lies far from all others until it is tied to them.
 
@@ -139,7 +139,7 @@ class RunData(NamedTuple):
     findings: dict[str, Finding]
 
 
-def _metric(section: str, direction: Direction, name: str, label: str, unit: str = "") -> Metric:
+def _metric(name: str, label: str, unit: str, direction: Direction, section: str) -> Metric:
     return Metric(name, label, unit, direction, section, lambda data: data.findings.get(name))
 
 
@@ -154,35 +154,35 @@ PIECES = "Pieces"
 """Heading of the metrics of a map in several pieces."""
 _PARTS = (("", "", "m2+rad2"), ("_trans2", ", trans", "m2"), ("_rot2", ", rot", "rad2"))
 RUN_METRICS: tuple[Metric, ...] = (
-    _metric("Extent", None, "steps", "steps"),
-    _metric("Extent", None, "duration", "duration", "s"),
-    _metric("Extent", None, "path", "length of the true path", "m"),
-    _metric("Extent", None, "experiences", "experiences"),
-    _metric("Extent", None, "links", "links"),
-    _metric("Health", None, "map_doubt", "map worse than odometry, probability"),
-    _metric(PIECES, None, "pieces", "pieces that nothing joins"),
-    _metric(PIECES, "low", "unjoined_share", "share of steps outside the largest piece"),
-    _metric(PIECES, "low", "energy_within_pieces", "Energy Metric within pieces", "m2+rad2"),
-    _metric(PIECES, "low", "ate_within_pieces", "ATE within pieces", "m"),
-    _metric("Trajectory", "low", "ate_final", "ATE, final", "m"),
-    _metric("Trajectory", "low", "ate_online", "ATE, online", "m"),
-    _metric("Trajectory", "low", "anytime_median", "online error, median", "m"),
-    _metric("Trajectory", "low", "anytime_late", "online error, RMS of the second half", "m"),
-    _metric("Trajectory", "low", "anytime_jump", "online error, largest jump", "m"),
-    _metric("Trajectory", "low", "rpe_translation", "RPE over one step, translation", "m"),
-    _metric("Trajectory", "low", "rpe_rotation_deg", "RPE over one step, rotation", "deg"),
-    _metric("Trajectory", "low", "relations_translation", "relations file, translation", "m"),
-    _metric("Trajectory", "low", "relations_rotation_deg", "relations file, rotation", "deg"),
+    _metric("steps", "steps", "", None, "Extent"),
+    _metric("duration", "duration", "s", None, "Extent"),
+    _metric("path", "length of the true path", "m", None, "Extent"),
+    _metric("experiences", "experiences", "", None, "Extent"),
+    _metric("links", "links", "", None, "Extent"),
+    _metric("map_doubt", "map worse than odometry, probability", "", None, "Health"),
+    _metric("pieces", "pieces that nothing joins", "", None, PIECES),
+    _metric("unjoined_share", "share of steps outside the largest piece", "", "low", PIECES),
+    _metric("energy_within_pieces", "Energy Metric within pieces", "m2+rad2", "low", PIECES),
+    _metric("ate_within_pieces", "ATE within pieces", "m", "low", PIECES),
+    _metric("ate_final", "ATE, final", "m", "low", "Trajectory"),
+    _metric("ate_online", "ATE, online", "m", "low", "Trajectory"),
+    _metric("anytime_median", "online error, median", "m", "low", "Trajectory"),
+    _metric("anytime_late", "online error, RMS of the second half", "m", "low", "Trajectory"),
+    _metric("anytime_jump", "online error, largest jump", "m", "low", "Trajectory"),
+    _metric("rpe_translation", "RPE over one step, translation", "m", "low", "Trajectory"),
+    _metric("rpe_rotation_deg", "RPE over one step, rotation", "deg", "low", "Trajectory"),
+    _metric("relations_translation", "relations file, translation", "m", "low", "Trajectory"),
+    _metric("relations_rotation_deg", "relations file, rotation", "deg", "low", "Trajectory"),
     *(
-        _metric("Energy Metric", "low", f"energy_{pairs}{suffix}", label + part, unit)
+        _metric(f"energy_{pairs}{suffix}", label + part, unit, "low", "Energy Metric")
         for pairs, label in _PAIRS.items()
         for suffix, part, unit in _PARTS
     ),
-    _metric("Experience Metric", None, "exm_base", "base set", "entries"),
-    _metric("Experience Metric", "high", "exm_arr", "ARR"),
-    *(_metric("Experience Metric", "high", f"exm_arcr_{mode}", f"ARCR, {mode}") for mode in EXM_MODES),
-    _metric("Experience Metric", "high", "exm_action_arr", "ARR, per action"),
-    _metric("Experience Metric", "high", "exm_action_arcr_strict", "ARCR, strict, per action"),
+    _metric("exm_base", "base set", "entries", None, "Experience Metric"),
+    _metric("exm_arr", "ARR", "", "high", "Experience Metric"),
+    *(_metric(f"exm_arcr_{mode}", f"ARCR, {mode}", "", "high", "Experience Metric") for mode in EXM_MODES),
+    _metric("exm_action_arr", "ARR, per action", "", "high", "Experience Metric"),
+    _metric("exm_action_arcr_strict", "ARCR, strict, per action", "", "high", "Experience Metric"),
 )
 """In the order of the scorecard."""
 _EXPERIENCE = [metric.name for metric in RUN_METRICS if metric.section == "Experience Metric"]
@@ -238,7 +238,7 @@ def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[s
     known, (translation, rotation) = len(run.online_error) > 0, rpe(final, truth)
     errors = summarize_errors(run.online_error if known else online_errors(online, truth))
     note, tied = "in the map of that time" if known else "of the online poses", ""
-    if jump := tie_jump(run.online, run.odometry):  # online poses were in a piece of their own at first
+    if jump := _tie_jump(run.online, run.odometry):  # online poses were in a piece of their own at first
         at, distance = run.time[jump[0]], jump[1]
         tied = f"with a jump of {distance:.1f} m at t = {at:.1f} s, as where a new piece is tied"
     unfinished = np.array_equal(run.final, run.online)

@@ -137,10 +137,8 @@ def write_tum(path: str | Path, time: np.ndarray, pose: np.ndarray) -> None:
 def _positions(estimate: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The positions of both as complex numbers x + iy: [N] each."""
     if len(estimate) != len(reference) or len(estimate) == 0:
-        found, expected = (
-            f"{len(estimate)} and {len(reference)} rows",
-            "the same number of rows, at least one",
-        )
+        found = f"{len(estimate)} and {len(reference)} rows"
+        expected = "the same number of rows, at least one"
         raise InputError("trajectories", found, expected, "interpolate one at the times of the other")
     estimate, reference = np.asarray(estimate, float), np.asarray(reference, float)
     return estimate[:, 0] + 1j * estimate[:, 1], reference[:, 0] + 1j * reference[:, 1]

@@ -3,116 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from evaluation.cells.information import information
-from evaluation.cells.rate_map import (
-    MapSettings,
-    arena_edges,
-    bin_activity,
-    known_poses,
-    rate_maps,
-    tuning_curves,
-)
+from evaluation.cells.rate_map import known_poses, rate_maps, recorded_sums, tuning_curves
 from evaluation.cells.recording import BinnedSums, CellRecording
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION, WIDTH
+from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION
 from tactile.base.errors import InputError
 
 MOST = 12
 """Largest number of cells in a plot of a run."""
 _COLUMNS, _GAP = 6, 0.14  # panels in a row; inches between them
-_SIDE = (WIDTH - style.LEFT - style.RIGHT - (_COLUMNS - 1) * _GAP) / _COLUMNS  # of a map, inches
+_SIDE = (style.INNER - (_COLUMNS - 1) * _GAP) / _COLUMNS  # of a map, inches
 _DIAL = 0.62 * _SIDE  # of a tuning curve, inches
 _LABEL = 0.5  # inches above a map
 
 
-class CellMaps(NamedTuple):
-    """What is drawn of n cells.
-
-    Attributes:
-        rates: [n, H, W] mean activity, NaN where the path was not. tuning: [n, B] over heading, bin b centred
-            on 2 pi b / B rad. x_edges, y_edges: of the place bins, m. seconds: [H, W]
-            time in each. cell: [n] indices in the flattened network.
-    """
-
-    rates: np.ndarray
-    tuning: np.ndarray
-    x_edges: np.ndarray
-    y_edges: np.ndarray
-    seconds: np.ndarray
-    cell: np.ndarray
-
-
-def map_cells(recording: CellRecording, most: int = MOST) -> CellMaps:
-    """Maps of up to `most` recorded cells: of the more active half of the chosen ones, or of all cells if
-    only sums were recorded, evenly spread over their indices.
+def choose_cells(recording: CellRecording, most: int = MOST) -> tuple[BinnedSums, np.ndarray]:
+    """The sums of up to `most` recorded cells and their indices in the flattened network: of the more active
+    half of the chosen ones, or of all cells if only sums were recorded, evenly spread over their indices.
 
     Raises:
-        InputError: no cells were recorded, no pose is known, the path has no area, or no bin was visited long
-            enough.
+        InputError: no cells were recorded, no pose is known or the path has no area.
     """
-    settings = MapSettings()
-    sums, cell = recording.sums, recording.cell
-    if sums is not None and len(cell) == 0:
-        cell = np.arange(len(sums.place))
-    elif len(cell) == 0:
-        raise InputError("recording", "no cells", "chosen cells or sums", "set cells.chosen or cells.sums")
-    else:
-        edges, bins = arena_edges(recording.truth, settings.place_bins), settings.heading_bins
-        sums = bin_activity(recording.time, recording.truth, recording.activity, *edges, bins)
+    sums, cell = recorded_sums(recording)
     total = sums.place.sum(axis=(1, 2))
     active = np.sort(np.argsort(-total, kind="stable")[: -(-len(cell) // 2)])
     chosen = active[np.unique(np.linspace(0, len(active) - 1, most).round().astype(int))]
-    picked = sums._replace(place=sums.place[chosen], heading=sums.heading[chosen])
-    return map_sums(picked, cell[chosen])
+    return sums._replace(place=sums.place[chosen], heading=sums.heading[chosen]), cell[chosen]
 
 
-def map_sums(sums: BinnedSums, cell: np.ndarray) -> CellMaps:
-    """Maps of `cell` [n], indices in the flattened network, from their sums, smoothed as by `MapSettings`.
+def draw_cells(title: str, sums: BinnedSums, cell: np.ndarray) -> style.Figure:
+    """Draws the rate map of each `cell` [n], with its spatial information and its peak, and below it its
+    activity over heading.
 
     Raises:
         InputError: no bin was visited long enough.
     """
-    made = MapSettings()
-    rates = rate_maps(sums, made.smoothing, made.least_seconds)
-    tuning = tuning_curves(sums, made.heading_smoothing, made.least_seconds)
-    return CellMaps(rates, tuning, sums.x_edges, sums.y_edges, sums.seconds, cell)
-
-
-def draw_cells(title: str, maps: CellMaps) -> style.Figure:
-    """Draws the rate map of each cell, with its spatial information and its peak, and below it its activity
-    over heading."""
-    cells, step = len(maps.rates), _LABEL + _SIDE + _DIAL + 0.1
-    height = style.TOP + -(-cells // _COLUMNS) * step + 0.1
-    wide = float(maps.x_edges[-1] - maps.x_edges[0])
+    rates, tuning = rate_maps(sums), tuning_curves(sums)
+    step = _LABEL + _SIDE + _DIAL + 0.1
+    height = style.TOP + -(-len(cell) // _COLUMNS) * step + 0.1
+    wide = float(sums.x_edges[-1] - sums.x_edges[0])
     line = f"activity over {wide:.3g} m of true places, dark 0 to yellow its own peak, and over true heading"
     line += "; peak: share of all"
     figure = style.new_figure(height, title, line)
-    bits = information(maps.rates, maps.seconds)
-    for k in range(cells):
+    bits = information(rates, sums.seconds)
+    for k in range(len(cell)):
         row, column = divmod(k, _COLUMNS)
         left, bottom = style.LEFT + column * (_SIDE + _GAP), height - style.TOP - _LABEL - _SIDE - row * step
         axes = style.add_axes(figure, left, bottom, _SIDE, _SIDE)
-        draw_rate_map(axes, maps.rates[k], maps.x_edges, maps.y_edges)
-        peak = np.nanmax(maps.rates[k])
+        draw_rate_map(axes, rates[k], sums.x_edges, sums.y_edges)
+        peak = np.nanmax(rates[k])
         said = f"{bits[k]:.2f} bits/spike\npeak {peak:.2g}" if peak > 0 else "silent"
-        label = f"cell {maps.cell[k]}\n{said}"
+        label = f"cell {cell[k]}\n{said}"
         axes.set_title(label, fontsize=7, color=LABEL_GREY, pad=2, linespacing=1.15)
         dial = left + (_SIDE - _DIAL) / 2, bottom - _DIAL - 0.06
-        draw_tuning(style.add_dial(figure, *dial, _DIAL), maps.tuning[k])
+        draw_tuning(style.add_dial(figure, *dial, _DIAL), tuning[k])
     return figure
 
 
 def draw_recorded_cells(title: str, recording: CellRecording) -> style.Figure:
-    """Draws `map_cells` of a recording; of one from which no map can be made, the reason."""
+    """Draws `choose_cells` of a recording; of one from which no map can be made, the reason."""
     try:
-        maps = map_cells(recording)
+        return draw_cells(title, *choose_cells(recording))
     except InputError as error:
         return style.new_figure(style.TOP, title, f"no rate maps: {error}")
-    return draw_cells(title, maps)
 
 
 def draw_rate_map(axes: style.Axes, rates: np.ndarray, x_edges: np.ndarray, y_edges: np.ndarray) -> None:

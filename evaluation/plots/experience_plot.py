@@ -11,7 +11,7 @@ from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREY, INK, LINE_GREY, VERMILLION
 from tactile.base.errors import InputError
 
-_HEIGHT, _BOTTOM = 5.2, 1.05  # inches
+_TALL, _BOTTOM = 3.25, 1.05  # inches
 
 
 def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
@@ -29,9 +29,7 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
         arcr = f"ARCR {judged.arcr:.2f} ({judged.correct} of {judged.relocalisations} correct, strict mode)"
         parts = (f"base set of {judged.base} steps", arr, arcr)
         line = "  ·  ".join(part for part in parts if "nan" not in part)
-    figure = style.new_figure(_HEIGHT, card.name, line)
-    inner = style.WIDTH - style.LEFT - style.RIGHT
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _HEIGHT - style.TOP - _BOTTOM)
+    figure, axes = style.new_chart(_TALL, _BOTTOM, card.name, line)
     counted = np.zeros(len(rows), bool) if judged is None else judged.counted
     right = counted if judged is None else judged.right
     free = ~counted

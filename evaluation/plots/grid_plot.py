@@ -23,42 +23,28 @@ _KEY, _BAR = 0.72, 0.15  # inches: right of the maps, and width of the colour ba
 _HEAD, _GAP, _BOTTOM = 0.48, 0.42, 1.0  # inches above a small map, between two, and below all
 
 
-class GridPaths(NamedTuple):
-    """Paths of a run, [T, 2] or [T, 3] each, m; truth may have NaN rows.
-
-    Attributes:
-        truth: true path. estimate: online poses of the filter. odometry: dead reckoning.
-    """
-
-    truth: np.ndarray
-    estimate: np.ndarray
-    odometry: np.ndarray
-
-
 class GridPanel(NamedTuple):
     """A map to draw.
 
     Attributes:
-        name: title. line: subtitle with its metrics. grid: the map. segments: [S, 4] true walls, m.
-        paths: the paths of the run.
+        name: title. line: subtitle with its metrics. segments: [S, 4] true walls, m. paths: of a run, [T, 2]
+            or [T, 3] each, m: the true path, which may have NaN rows, online poses of the filter, and dead
+            reckoning.
     """
 
     name: str
     line: str
     grid: OccupancyGrid
     segments: np.ndarray = NO_SEGMENTS
-    paths: GridPaths | None = None
+    paths: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
 def draw_grid(panel: GridPanel) -> style.Figure:
     """Draws one map with its walls and paths (Fox et al. 2012, Fig. 6)."""
-    inner = WIDTH - style.LEFT - style.RIGHT - _KEY
+    inner = style.INNER - _KEY
     tall = inner * _aspect(panel.grid)
-    figure = style.new_figure(style.TOP + tall + _BOTTOM, panel.name, panel.line)
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, tall)
-    _paint(axes, panel)
-    if panel.paths is not None:
-        _paint_paths(axes, panel.paths, errors=True)
+    figure, axes = style.new_chart(tall, _BOTTOM, panel.name, panel.line, right=_KEY)
+    _paint(axes, panel, errors=True)
     _paint_key(figure, style.LEFT + inner, _BOTTOM, min(tall, 2.4))
     style.add_legend(figure, axes, columns=3)
     return figure
@@ -68,7 +54,7 @@ def draw_grids(title: str, line: str, panels: Sequence[GridPanel], *, across: in
     """Draws maps side by side, `across` per row (Fox et al. 2012, Figs. 4 and 5)."""
     across = min(across, len(panels))
     rows = -(-len(panels) // across)
-    inner = WIDTH - style.LEFT - style.RIGHT - _KEY
+    inner = style.INNER - _KEY
     width = (inner - (across - 1) * _GAP) / across
     high = width * max(_aspect(panel.grid) for panel in panels)
     whole = style.TOP + rows * (_HEAD + high) + (rows - 1) * _GAP + _BOTTOM
@@ -80,8 +66,6 @@ def draw_grids(title: str, line: str, panels: Sequence[GridPanel], *, across: in
         tall = width * _aspect(panel.grid)
         axes = style.add_axes(figure, left, top - tall, width, tall)
         _paint(axes, panel)
-        if panel.paths is not None:
-            _paint_paths(axes, panel.paths)
         if column:
             axes.set_ylabel("")
             if axes.get_ylim() == figure.axes[-2].get_ylim():
@@ -114,8 +98,8 @@ def _aspect(grid: OccupancyGrid) -> float:
     return height / width
 
 
-def _paint(axes: style.Axes, panel: GridPanel) -> None:
-    """Draws the map and the walls in the order of the legend."""
+def _paint(axes: style.Axes, panel: GridPanel, *, errors: bool = False) -> None:
+    """Draws the map, the walls and the paths in the order of the legend, which has their `errors`."""
     from matplotlib.collections import LineCollection
 
     grid, (height, width) = panel.grid, panel.grid.probability.shape
@@ -132,11 +116,9 @@ def _paint(axes: style.Axes, panel: GridPanel) -> None:
     if len(panel.segments):
         walls = list(panel.segments.reshape(-1, 2, 2))
         axes.add_collection(LineCollection(walls, colors=VERMILLION, lw=1.0, zorder=2, label="true walls"))
-
-
-def _paint_paths(axes: style.Axes, paths: GridPaths, *, errors: bool = False) -> None:
-    """Draws the paths within the map, with their errors in the legend if `errors`."""
-    truth, estimate, odometry = (np.asarray(path)[:, :2] for path in paths)
+    if panel.paths is None:
+        return
+    truth, estimate, odometry = (np.asarray(path)[:, :2] for path in panel.paths)
 
     def name(word: str, path: np.ndarray) -> str:
         away = np.hypot(*(path - truth).T)

@@ -55,6 +55,17 @@ class Layers(NamedTuple):
         truth = compose(to_map, run.truth)
         return cls(_xy(truth), _xy(odometry), _xy(run.final), _xy(run.nodes), to_map)
 
+    def box(self, room: float, *others: np.ndarray) -> np.ndarray:
+        """[[left, bottom], [right, top]] of truth, map and other points, and of odometry near them: within
+        `room`, as a share of the size."""
+        known = [self.final, self.nodes, *others] + ([] if self.truth is None else [self.truth])
+        low, high = bounds(*known)
+        margin, (far_low, far_high) = room * (high - low).max(), bounds(self.odometry)
+        if room:
+            low = np.minimum(low, np.maximum(far_low, low - margin))
+            high = np.maximum(high, np.minimum(far_high, high + margin))
+        return np.stack([low, high])
+
 
 def draw_map(
     run: RunArrays, card: Scorecard, walls: np.ndarray = NO_WALLS, closures: np.ndarray = NO_CLOSURES
@@ -78,15 +89,9 @@ def draw_map(
     run = arrange_pieces(run)
     layers = Layers.align(run)
     shown = walls if layers.truth is not None else NO_WALLS
-    # The box around truth, walls and map, and around odometry near them.
-    truth = layers.truth
-    points = [layers.final, layers.nodes] + ([] if truth is None else [truth])
-    low, high = bounds(*points, wall_corners(shown, layers.to_map))
-    if len(shown) == 0:
-        room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
-        low = np.minimum(low, np.maximum(far_low, low - room))
-        high = np.maximum(high, np.minimum(far_high, high + room))
-    figure, axes = style.map_figure(style.frame(np.stack([low, high])), card.name, line, of)
+    truth, corners = layers.truth, wall_corners(shown, layers.to_map)
+    box = layers.box(0.0 if len(shown) else _ROOM, corners)
+    figure, axes = style.map_figure(style.frame(box), card.name, line, of)
     if len(shown):
         draw_walls(axes, shown, layers.to_map)
         _paint_laps(axes, run, layers, card.exm.position, closures)
@@ -201,20 +206,27 @@ def _paint_path(
     axes: style.Axes, run: RunArrays, path: np.ndarray, truth: np.ndarray | None = None, **line: Any
 ) -> None:
     """Draws the mapped path [N, 2], each piece of the map in a colour of its own, `run.main` in blue."""
+    pieces = path_pieces(run, path, truth)
+    for rank, name, points in pieces:
+        if rank >= NAMED:
+            name = "_" if rank > NAMED else f"{len(pieces) - NAMED} smaller pieces"
+        axes.plot(*points.T, color=PIECES[min(rank, NAMED)], label=name or "mapped path", **line)
+
+
+def path_pieces(
+    run: RunArrays, path: np.ndarray, truth: np.ndarray | None
+) -> list[tuple[int, str, np.ndarray]]:
+    """Rank, name and line of each piece of a path [N, 2], `run.main` first with rank 0, interrupted where the
+    robot was moved by hand (by the truth); a path in one piece has no name."""
     truth = path if len(run.state) else truth  # a pose that is searched for jumps as well
 
-    def drawn(rows: np.ndarray) -> np.ndarray:
+    def drawn(rows: np.ndarray | slice) -> np.ndarray:
         return path[rows] if truth is None else split_at_jumps(path[rows], truth[rows])
 
     if not run.has_pieces and not len(run.state):
-        axes.plot(*drawn(np.arange(len(path))).T, color=BLUE, label="mapped path", **line)
-        return
+        return [(0, "", drawn(slice(None)))]
     pieces = run.ranked_pieces()
-    for rank, number in pieces:
-        rows, name = np.flatnonzero(run.piece == number), run.name_piece(number)
-        if rank >= NAMED:
-            name = "_" if rank > NAMED else f"{len(pieces) - NAMED} smaller pieces"
-        axes.plot(*drawn(rows).T, color=PIECES[min(rank, NAMED)], label=name, **line)
+    return [(rank, run.name_piece(one), drawn(np.flatnonzero(run.piece == one))) for rank, one in pieces]
 
 
 def _older(links: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.plots.cell_plot import draw_recorded_cells
 from evaluation.plots.experience_plot import draw_experience_history
-from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grid, grid_headline
+from evaluation.plots.grid_plot import GridPanel, draw_grid, grid_headline
 from evaluation.plots.map_plot import Layers, draw_changes, draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
 from tactile.base.bounded import read_json
@@ -80,10 +80,10 @@ def _grid_panel(directory: Path, run: RunArrays) -> GridPanel:
         true = np.full((1, 2), np.nan) if layers.truth is None else layers.truth
         known = np.where(run.found[:, None], shown.final[:, :2], np.nan)
         line = f"found in {run.found.sum():,} of {len(run.time):,} steps"
-        return GridPanel(directory.name, line, grid, paths=GridPaths(true, known, layers.odometry))
+        return GridPanel(directory.name, line, grid, paths=(true, known, layers.odometry))
     if run.truth is None or not (directory / "arena.npz").exists():
         return GridPanel(directory.name, "", grid)
     truth, start = read_grid_truth(directory / "arena.npz")
     score = read_json(directory / "gridscore.json", "the scores of a grid", GridScore.model_validate)
-    paths = GridPaths(between(start, run.truth), run.online, run.odometry)
+    paths = (between(start, run.truth), run.online, run.odometry)
     return GridPanel(directory.name, grid_headline(score), grid, truth.segments, paths)

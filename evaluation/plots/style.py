@@ -27,7 +27,8 @@ ORANGE = "#e69f00"
 SKY = "#56b4e9"
 
 WIDTH, LEFT, RIGHT, TOP = 8.0, 0.62, 0.25, 0.90
-"""Width and margins of every plot, inches."""
+INNER = WIDTH - LEFT - RIGHT
+"""Width and margins of every plot, and width between the margins, inches."""
 BOTTOM = 1.0
 """Room below the axes of a map, inches."""
 MARGIN, FLATTEST, TALLEST = 0.08, 0.4, 1.15
@@ -49,6 +50,12 @@ def new_figure(height: float, title: str, line: str) -> Figure:
     figure.text(left, 1 - 0.42 / height, title, fontsize=15, weight="bold", color=INK)
     figure.text(left, 1 - 0.70 / height, line, fontsize=9.2, color=LABEL_GREY)
     return figure
+
+
+def new_chart(tall: float, bottom: float, title: str, line: str, right: float = 0.0) -> tuple[Figure, Axes]:
+    """A figure with axes of a height above a bottom margin, up to an extra margin at the right, inches."""
+    figure = new_figure(TOP + tall + bottom, title, line)
+    return figure, add_axes(figure, LEFT, bottom, INNER - right, tall)
 
 
 def add_axes(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
@@ -103,9 +110,7 @@ def frame(points: np.ndarray) -> np.ndarray:
 def map_figure(box: np.ndarray, title: str, line: str, of: str) -> tuple[Figure, Axes]:
     """A figure with equal axes (m) that show a box [[left, bottom], [right, top]] in the frame `of` a map."""
     width, height = box[1] - box[0]
-    inner = WIDTH - LEFT - RIGHT
-    figure = new_figure(inner * height / width + TOP + BOTTOM, title, line)
-    axes = add_axes(figure, LEFT, BOTTOM, inner, inner * height / width)
+    figure, axes = new_chart(INNER * height / width, BOTTOM, title, line)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
     metre_grid(axes, of)
     return figure, axes

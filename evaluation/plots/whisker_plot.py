@@ -62,8 +62,7 @@ def draw_whiskers(
     chosen = _spread(pose, loop, 2.4 * reach)
 
     parts = np.array_split(np.arange(len(run.time)), min(MAX_STRIPS, -(-len(run.time) // STRIP_COLUMNS)))
-    inner = style.WIDTH - style.LEFT - style.RIGHT
-    high = (inner - _KEY) * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])
+    high = (style.INNER - _KEY) * (box[1, 1] - box[0, 1]) / (box[1, 0] - box[0, 0])
     tall = images.view[0].size * _ROW
     total = style.TOP + _MARKS + len(parts) * (tall + _GAP) + 0.25 + high + _BOTTOM
     rings = ", ".join(f"{1000 * length:.0f}" for length in images.length)
@@ -77,13 +76,13 @@ def draw_whiskers(
     pixels[~images.alive] = to_rgb(_DEAD)
     for part in parts:
         bottom -= tall + _GAP
-        axes = style.add_axes(figure, style.LEFT, bottom, inner, tall)
+        axes = style.add_axes(figure, style.LEFT, bottom, style.INNER, tall)
         _paint_strip(axes, run.time, pixels, part, chosen)
         rows_of_ring = images.view.shape[2] * (np.arange(len(images.length)) + 0.5)
         axes.set_yticks(rows_of_ring, [f"{1000 * length:.0f} mm" for length in images.length])
     style.name_axes(axes, "time (s); rows: whiskers of each ring, anticlockwise from ahead", "")
 
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner - _KEY, high)
+    axes = style.add_axes(figure, style.LEFT, _BOTTOM, style.INNER - _KEY, high)
     axes.set(xlim=box[:, 0], ylim=box[:, 1], aspect="equal")
     style.metre_grid(axes, style.TRUTH if len(rows) else style.MAP)
     if len(shown):
@@ -93,7 +92,7 @@ def draw_whiskers(
         _paint_head(axes, pose[step], reach, pixels[step], images.azimuth)
         x, y, _ = pose[step]
         axes.text(x, y, str(number), ha="center", va="center", fontsize=7, color=INK, zorder=5)
-    _paint_key(figure, images, style.LEFT + inner - _KEY, high)
+    _paint_key(figure, images, style.LEFT + style.INNER - _KEY, high)
     return figure
 
 

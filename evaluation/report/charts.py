@@ -15,7 +15,7 @@ from evaluation.artifacts.closure_table import ACCEPTED
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.run_metrics import DOUBTED
 from evaluation.metrics.trajectory import position_errors
-from evaluation.plots.map_plot import bounds, split_at_jumps, wall_corners
+from evaluation.plots.map_plot import bounds, path_pieces, split_at_jumps, wall_corners
 from evaluation.report.run_report import WORDS, RunReport
 from tactile.base.se2 import compose, inverse
 
@@ -79,17 +79,14 @@ def _map_chart(report: RunReport) -> Any:
     traces.append(_line(layers.odometry, "odometry", "odometry", width=1, opacity=0.6))
     if report.map_path is not None:
         traces.append(_line(report.map_path, "map, not believed", "doubted", dash="dot", width=1.2))
-    traces += _path_traces(report)
     run = report.run
+    for rank, name, path in path_pieces(run, layers.final, layers.truth):
+        role = f"run{rank % RUN_ROLES}" if rank else "final"
+        traces.append(_line(path, name or "trajectory", role, width=1.6))
     main = f"piece {run.main + 1}," if run.has_pieces and not len(run.state) else "the map,"
     traces = [*traces, *_place_traces(report), *_closure_traces(report)]
-    # The frame around the map, and around odometry near it.
-    points = [layers.final, layers.nodes] + ([] if layers.truth is None else [layers.truth])
-    low, high = bounds(*points, corners, report.truth_lines.reshape(-1, 2))
-    room, (far_low, far_high) = _ROOM * (high - low).max(), bounds(layers.odometry)
-    low = np.minimum(low, np.maximum(far_low, low - room))
-    high = np.maximum(high, np.minimum(far_high, high + room))
-    figure = _map_figure(traces, _around(low, high), main)
+    box = layers.box(_ROOM, corners, report.truth_lines.reshape(-1, 2))
+    figure = _map_figure(traces, box, main)
     # The links, and of each verdict the lines between the two places, in the order of its marks.
     links = layers.nodes[run.links]
     shapes = [_line_shape(links, "link", "solid", "experience")] if len(links) else []
@@ -101,21 +98,6 @@ def _map_chart(report: RunReport) -> Any:
     return figure
 
 
-def _path_traces(report: RunReport) -> list[Any]:
-    """The final trajectory, each piece of the map by itself, `run.main` as the trajectory of one piece."""
-    final, truth, traces = report.layers.final, report.layers.truth, []
-    if not report.run.has_pieces and not len(report.run.state):
-        path = final if truth is None else split_at_jumps(final, truth)
-        return [_line(path, "trajectory", "final", width=1.6)]
-    truth = final if len(report.run.state) else truth  # a pose that is searched for jumps as well
-    for rank, number in report.run.ranked_pieces():
-        rows = np.flatnonzero(report.run.piece == number)
-        path = final[rows] if truth is None else split_at_jumps(final[rows], truth[rows])
-        name = report.run.name_piece(number)
-        traces.append(_line(path, name, f"run{rank % RUN_ROLES}" if rank else "final", width=1.6))
-    return traces
-
-
 def overlay_chart(reports: Sequence[RunReport]) -> Any:
     """The final trajectories of several runs, each aligned to its truth, over the truth of the first."""
     known = [_as_true(each, each.layers.truth) for each in reports if each.layers.truth is not None][:1]
@@ -125,7 +107,8 @@ def overlay_chart(reports: Sequence[RunReport]) -> Any:
         _line(path, report.name, *_run_style(k))
         for k, (path, report) in enumerate(zip(paths, reports, strict=True))
     ]
-    return _map_figure(traces, _around(*bounds(*paths, *known)), "the truth, or of the map,")
+    box = np.stack(bounds(*paths, *known))
+    return _map_figure(traces, box, "the truth, or of the map,")
 
 
 def _as_true(report: RunReport, points: np.ndarray) -> np.ndarray:
@@ -234,19 +217,15 @@ def _line(
     )
 
 
-def _map_figure(traces: list[Any], frame: np.ndarray, of: str = "the map,") -> Any:
-    """A figure with equal scales that shows a frame [[left, bottom], [right, top]], m."""
+def _map_figure(traces: list[Any], box: np.ndarray, of: str) -> Any:
+    """A figure with equal scales that shows a box [[left, bottom], [right, top]], m, with a margin."""
     figure = _figure(traces, f"x in the frame of {of} m", f"y in the frame of {of} m")
     figure.update_layout(dragmode="pan")
+    margin = max(_MARGIN * (box[1] - box[0]).max(), 1e-3)
+    frame = np.stack([box[0] - margin, box[1] + margin])
     figure.update_xaxes(range=frame[:, 0].tolist(), constrain="range")
     figure.update_yaxes(range=frame[:, 1].tolist(), constrain="range", scaleanchor="x", scaleratio=1)
     return figure
-
-
-def _around(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Corners [[left, bottom], [right, top]] with a margin."""
-    margin = max(_MARGIN * (high - low).max(), 1e-3)
-    return np.stack([low - margin, high + margin])
 
 
 def _figure(traces: list[Any], across: str, up: str, zero: bool = False) -> Any:

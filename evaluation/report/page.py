@@ -136,10 +136,7 @@ def _figure_data(figure: Any) -> Any:
 
 
 def _run_context(
-    number: int,
-    report: RunReport,
-    settings: Sequence[tuple[str, str, str]] | None,
-    charts: dict[str, Any],
+    number: int, report: RunReport, settings: Sequence[tuple[str, str, str]] | None, charts: dict[str, Any]
 ) -> dict[str, Any]:
     """What the template `run.html` shows of a run."""
     return {

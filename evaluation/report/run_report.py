@@ -15,7 +15,7 @@ from evaluation.artifacts.manifest import RUNNING, Manifest, read_manifest
 from evaluation.artifacts.recorded_views import ClosureViews, read_closure_views
 from evaluation.artifacts.run_reader import (
     check_run_directory,
-    read_column,
+    read_columns,
     read_run,
     read_scorecard,
     read_walls,
@@ -110,7 +110,7 @@ def read_run_report(directory: Path) -> RunReport:
     measured, steps = read_run(directory), directory / "steps.csv"
     run = arrange_pieces(measured)
     count = len(run.time)
-    doubt = read_column(steps, "doubt", np.nan)[:count]
+    doubt = read_columns(steps, "doubt", empty=np.nan)[0][:count]
     verdict, known = judge_map(run.doubt, run.unjudged), doubt[np.isfinite(doubt)]
     if run.unjudged == UNFINISHED and len(known):
         run = run._replace(doubt=float(known[-1]))
@@ -134,7 +134,7 @@ def read_run_report(directory: Path) -> RunReport:
         card=read_scorecard(directory) if scored else score_run(measured, name),
         verdict=verdict,
         doubt=doubt,
-        spread=np.hypot(read_column(steps, "sd_x"), read_column(steps, "sd_y"))[:count],
+        spread=np.hypot(*read_columns(steps, "sd_x", "sd_y"))[:count],
         belief=belief,
         belief_step=belief_step,
         online_time=online_time,
@@ -197,16 +197,15 @@ def _belief(steps: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     header = read_text(steps, "a file of a run directory").partition("\n")[0].split(",")
     if "second" not in header:
         return np.zeros((0, 3)), np.zeros(0, int)
-    keyframe, *belief = (
-        read_column(steps, name)[:count] for name in ("keyframe", "posterior", "second", "novelty")
-    )
+    keyframe, *belief = read_columns(steps, "keyframe", "posterior", "second", "novelty")
+    keyframe = keyframe[:count]
     at = np.flatnonzero(keyframe >= 0)
     return np.stack(belief, axis=1)[at], at
 
 
 def _columns(file: Path, *names: str) -> list[np.ndarray]:
     """Columns of a file; empty ones without it."""
-    return [read_column(file, name) if file.exists() else np.zeros(0) for name in names]
+    return read_columns(file, *names) if file.exists() else [np.zeros(0)] * len(names)
 
 
 VIEW_BYTES = 2_000_000
@@ -256,7 +255,10 @@ def view_records(views: ClosureViews | None) -> dict[str, Any] | None:
     image, shape = views.view, views.view.shape[1:]
     while image.size > VIEW_BYTES and max(image.shape[1:]) > 1:
         image = halve(image)
-    gain = display_gain(image)
+    # The factor, at least 1, that makes the brightest hundredth of the non-zero pixels white. Views of a room
+    # that is small beside the range of the sensor would be black otherwise.
+    seen = image[image > 0]
+    gain = max(255 / float(np.quantile(seen, 0.99)), 1.0) if seen.size else 1.0
     image = np.minimum(np.ceil(image * gain), 255).astype(np.uint8)
     return {
         "steps": views.step.tolist(),
@@ -266,15 +268,6 @@ def view_records(views: ClosureViews | None) -> dict[str, Any] | None:
         "shape": list(shape),
         "pixels": b64encode(np.ascontiguousarray(image).tobytes()).decode(),
     }
-
-
-def display_gain(image: np.ndarray) -> float:
-    """The factor, at least 1, that makes the brightest hundredth of the non-zero pixels [n, R, C] white.
-
-    Views of a room that is small beside the range of the sensor would be black otherwise.
-    """
-    seen = image[image > 0]
-    return max(255 / float(np.quantile(seen, 0.99)), 1.0) if seen.size else 1.0
 
 
 def halve(image: np.ndarray) -> np.ndarray:

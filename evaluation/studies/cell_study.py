@@ -7,14 +7,12 @@ correlations; the pictures show scores over the parameters, and rate maps.
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -26,43 +24,20 @@ from evaluation.plots.cell_plot import draw_rate_map
 from evaluation.plots.style import BLUE, LABEL_GREY, WIDTH
 from evaluation.studies.executor import Executor
 from evaluation.studies.network_batch import SEGMENT, CellSets, CellTrack, walk
+from evaluation.studies.study import preset_settings
 from evaluation.studies.study_course import CELLS, StudyCourse, read_course
-from evaluation.studies.study_report import format_number, render_table
+from evaluation.studies.study_report import csv_text, format_number, render_table, save_files
 from ratslam.classic.config import rings, units
 from ratslam.classic.pose_cells import Outcome
 from ratslam.core.compilation import Precision, prepare_precision
 from ratslam.runs.settings.run_config import load_config
-from ratslam.runs.settings.strict_yaml import Document, override, validate
-from ratslam.runs.settings.yaml_document import Place
 from tactile.base.errors import os_errors_of
-from tactile.base.files import flush_to_disk, write_atomically, write_text_atomically
+from tactile.base.files import flush_to_disk, write_atomically
 from tactile.base.random_streams import stream
 from tactile.base.settings import Settings
 
-
-class _SetScores(NamedTuple):
-    """The scores of B networks.
-
-    Drift is the packet, followed round the torus, minus the pose that it would have without drift. The
-    decoding error is the same on the torus, the shortest way.
-
-    Attributes:
-        drift, drift_heading: [B] rms over the course, m and rad. drift_end, drift_heading_end: [B] after the
-            last step, m and rad. decoding, decoding_heading: [B] mean over the course, m and rad. reseeded:
-            [B] share of steps at which activity had died out. larger: [B] share of steps that needed more
-            than the smallest window. maps: [B, C, H, W] float32 mean activity of the chosen cells in each
-            place bin, NaN where the robot never was.
-    """
-
-    drift: np.ndarray
-    drift_heading: np.ndarray
-    drift_end: np.ndarray
-    drift_heading_end: np.ndarray
-    decoding: np.ndarray
-    decoding_heading: np.ndarray
-    reseeded: np.ndarray
-    larger: np.ndarray
-    maps: np.ndarray
+_Scores = dict[str, np.ndarray]
+"""See `score_task`."""
 
 
 class _Sums:
@@ -101,7 +76,7 @@ class _Sums:
         weight = activity * self._study.seconds[None, rows, None]
         self._maps += np.bincount(at.ravel(), weight.ravel(), self._maps.size).reshape(self._maps.shape)
 
-    def scores(self) -> _SetScores:
+    def scores(self) -> _Scores:
         """The scores of all steps added."""
         study, steps = self._study, len(self._study.expected)
         seconds = np.bincount(study.bin, study.seconds, self._bins)
@@ -109,11 +84,13 @@ class _Sums:
         mean = np.divide(maps, seconds, out=np.full_like(maps, np.nan), where=seconds > 0)
         place = len(study.y_edges) - 1, len(study.x_edges) - 1
         rms, mean_error = np.sqrt(self._squares / steps), self._errors / steps
-        return _SetScores(
-            rms[:, 0], rms[:, 1], self._last[:, 0], self._last[:, 1], mean_error[:, 0], mean_error[:, 1],
-            self._reseeded / steps, self._larger / steps,
-            mean.astype(np.float32).reshape(*maps.shape[:2], *place),
-        )  # fmt: skip
+        return {
+            "drift": rms[:, 0], "drift_heading": rms[:, 1],
+            "drift_end": self._last[:, 0], "drift_heading_end": self._last[:, 1],
+            "decoding": mean_error[:, 0], "decoding_heading": mean_error[:, 1],
+            "reseeded": self._reseeded / steps, "larger": self._larger / steps,
+            "maps": mean.astype(np.float32).reshape(*maps.shape[:2], *place),
+        }  # fmt: skip
 
     def _shortest(self, difference: np.ndarray) -> np.ndarray:
         return difference - self._ring * np.round(difference / self._ring)
@@ -122,23 +99,6 @@ class _Sums:
         """[..., 2] m and rad of differences [..., 3] in cells."""
         x, y, heading = np.moveaxis(error * self._unit, -1, 0)
         return np.stack([np.hypot(x, y), np.abs(heading)], axis=-1)
-
-
-def score_sets(study: StudyCourse, sets: CellSets, dtype: np.dtype) -> _SetScores:
-    """Simulates B networks over the course in the given precision and scores them.
-
-    Memory does not depend on the length of the course, apart from the course itself.
-    """
-    course = study.course._replace(
-        **{
-            name: np.asarray(getattr(study.course, name), dtype)
-            for name in ("motion", "noise", "turned", "energy")
-        }
-    )
-    sums = _Sums(study, len(sets.speed_noise))
-    for k, track in enumerate(walk(study.config, sets, course, study.chosen)):
-        sums.add(k * SEGMENT, track)
-    return sums.scores()
 
 
 FOLDER = "sets"
@@ -159,65 +119,47 @@ Width = Annotated[
 ]
 
 
-class CellPlan(Settings):
+class _CellPlan(Settings):
     """The settings of a study of many networks. Each range is [low, high]; equal ends fix a parameter."""
 
     sets: PositiveInt = 1000
     """Parameter sets: the first of a Halton sequence over the ranges, so that a larger study contains a
     smaller one."""
-    views: bool = False
-    """Whether views of the session inject energy; otherwise path integration alone."""
-    steps: Annotated[int, Field(ge=2)] = 30_000
-    """Most steps of the session to use."""
-    excite_sigma: Width = (0.8, 1.2)
-    """Standard deviation of excitation, cells."""
-    inhibit_sigma: Width = (1.6, 2.4)
-    """Standard deviation of inhibition, cells."""
-    global_inhibition: Range = (0.0, 4e-5)
-    """Activity subtracted from every cell at each sub-step."""
-    energy: Range = (0.5, 2.0)
-    """Factor on the energy that views inject."""
-    speed_noise: Range = (0.0, 0.2)
-    """Standard deviation of each step's motion, as a share of it."""
-    heading_noise: Range = (0.0, 0.1)
-    """Standard deviation of the heading, rad / sqrt(s)."""
+    views: bool = False  # whether views of the session inject energy; otherwise path integration alone
+    steps: Annotated[int, Field(ge=2)] = 30_000  # most steps of the session to use
+    excite_sigma: Width = (0.8, 1.2)  # standard deviation of excitation, cells
+    inhibit_sigma: Width = (1.6, 2.4)  # standard deviation of inhibition, cells
+    global_inhibition: Range = (0.0, 4e-5)  # activity subtracted from every cell at each sub-step
+    energy: Range = (0.5, 2.0)  # factor on the energy that views inject
+    speed_noise: Range = (0.0, 0.2)  # standard deviation of each step's motion, as a share of it
+    heading_noise: Range = (0.0, 0.1)  # standard deviation of the heading, rad / sqrt(s)
     chosen: Annotated[tuple[NonNegativeInt, ...], Field(max_length=CELLS)] = ()
     """Cells whose rate maps are made, indices in the flattened network; none: eight on the way."""
-    bins: Annotated[int, Field(ge=2, le=100)] = 20
-    """Place bins along each side of the square round the path."""
+    bins: Annotated[int, Field(ge=2, le=100)] = 20  # place bins along each side of the square round the path
     chunk: Annotated[int, Field(ge=1, le=1024)] = 32
     """Parameter sets of a job, whose scores are written together."""
     seed: NonNegativeInt = 0
     """Seed of the parameter sets and of the noise, which is the same for all sets apart from its size."""
-    precision: Precision = "float32"
-    """Floating-point type of the networks."""
+    precision: Precision = "float32"  # floating-point type of the networks
 
 
 PARAMETERS = ("excite_sigma", "inhibit_sigma", "global_inhibition", "energy", "speed_noise", "heading_noise")
-"""Columns of parameter sets, and the ranges of a `CellPlan`."""
+"""Columns of parameter sets, and the ranges of a `_CellPlan`."""
 
 
 class _CellStudy(NamedTuple):
-    """A checked study. parameters: [sets, 6] in the order of `PARAMETERS`."""
+    """A checked study, or a chunk of one: some of its parameter sets."""
 
     name: str
-    plan: CellPlan
+    plan: _CellPlan
     course: StudyCourse
-    parameters: np.ndarray
-
-
-class _Chunk(NamedTuple):
-    """A chunk of n parameter sets [n, 6]. size: sets of a whole chunk, which are simulated together."""
-
-    course: StudyCourse
-    parameters: np.ndarray
-    size: int
-    precision: Precision
+    parameters: np.ndarray  # [sets, 6] in the order of `PARAMETERS`
 
     @property
     def key(self) -> str:
         """Hash of all that decides the scores, apart from the code."""
-        content = hashlib.sha256(f"{self.course.config!r} {self.size} {self.precision}".encode())
+        plan = self.plan
+        content = hashlib.sha256(f"{self.course.config!r} {plan.chunk} {plan.precision}".encode())
         for array in jax.tree.leaves((self.course[2:], self.parameters)):
             content.update(f"{array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return content.hexdigest()[:16]
@@ -227,30 +169,23 @@ def cell_study(path: Path, overrides: Sequence[str] = ()) -> _CellStudy:
     """The study of a configuration file; reads its session.
 
     Args:
-        overrides: each `a.b=value`: a key of `CellPlan` where it is one, else of the configuration.
+        overrides: each `a.b=value`: a key of `_CellPlan` where it is one, else of the configuration.
 
     Raises:
         InputError: a setting is invalid, or see `read_course`.
     """
-    own = [text for text in overrides if text.partition("=")[0] in CellPlan.model_fields]
-    empty = Document({}, {(): Place("--preset cells", "--preset cells")})
-    plan = validate(override(empty, own), CellPlan)
-    config = load_config(path, [text for text in overrides if text not in own])
-    course = read_course(config, plan.steps, plan.views, plan.bins, plan.chosen, plan.seed)
-    return _CellStudy(f"{path.stem}-cells", plan, course, parameter_sets(plan))
-
-
-def parameter_sets(plan: CellPlan) -> np.ndarray:
-    """[sets, 6] parameters in the order of `PARAMETERS`: points of a scrambled Halton sequence (Owen 2017,
-    arXiv:1706.02808)."""
+    plan, others = preset_settings(_CellPlan, "cells", overrides)
+    course = read_course(load_config(path, others), plan.steps, plan.views, plan.bins, plan.chosen, plan.seed)
+    # Points of a scrambled Halton sequence (Owen 2017, arXiv:1706.02808).
     ends = np.array([getattr(plan, name) for name in PARAMETERS])
     share = qmc.Halton(len(PARAMETERS), rng=stream(plan.seed, "cells.sets")).random(plan.sets)
-    return ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    parameters = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    return _CellStudy(f"{path.stem}-cells", plan, course, parameters)
 
 
 def run_cell_study(
     study: _CellStudy, folder: Path, executor: Executor, done: Callable[[int], object] = lambda sets: None
-) -> _SetScores:
+) -> _Scores:
     """The scores of all parameter sets, in their order; each chunk is on disk before it counts as done.
 
     Args:
@@ -276,30 +211,49 @@ def run_cell_study(
     parts = []
     for path in files.values():
         with np.load(path) as found:
-            parts.append(_SetScores(**found))
-    return _SetScores(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+            parts.append(dict(found))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def tasks_of(study: _CellStudy) -> list[_Chunk]:
+def tasks_of(study: _CellStudy) -> list[_CellStudy]:
     """The chunks of a study."""
-    plan = study.plan
-    first = range(0, len(study.parameters), plan.chunk)
-    rows = [study.parameters[k : k + plan.chunk] for k in first]
-    return [_Chunk(study.course, each, plan.chunk, plan.precision) for each in rows]
+    size, rows = study.plan.chunk, study.parameters
+    return [study._replace(parameters=rows[k : k + size]) for k in range(0, len(rows), size)]
 
 
-def score_task(task: _Chunk) -> _SetScores:
-    """The scores of a chunk; a part of one is filled up, so that its bits do not depend on the number."""
-    prepare_precision(task.precision)
-    rows = np.arange(task.size).clip(max=len(task.parameters) - 1)
+def score_task(task: _CellStudy) -> _Scores:
+    """Simulates the networks of a chunk over the course and scores them.
+
+    A part of a chunk is filled up, so that its bits do not depend on the number. Memory does not depend on
+    the length of the course, apart from the course itself. Drift is the packet, followed round the torus,
+    minus the pose that it would have without drift. The decoding error is the same on the torus, the shortest
+    way.
+
+    Returns:
+        By name of n networks, drift, drift_heading: [n] rms over the course, m and rad. drift_end,
+            drift_heading_end: [n] after the last step, m and rad. decoding, decoding_heading: [n] mean over
+            the course, m and rad. reseeded: [n] share of steps at which activity had died out. larger: [n]
+            share of steps that needed more than the smallest window. maps: [n, C, H, W] float32 mean activity
+            of the chosen cells in each place bin, NaN where the robot never was.
+    """
+    plan, study, count = task.plan, task.course, len(task.parameters)
+    prepare_precision(plan.precision)
+    rows = np.arange(plan.chunk).clip(max=count - 1)
     sets = CellSets(**dict(zip(PARAMETERS, task.parameters[rows].T, strict=True)))
-    scores = score_sets(task.course, sets, np.dtype(task.precision))
-    return _SetScores(*(column[: len(task.parameters)] for column in scores))
+    precise = {
+        name: np.asarray(getattr(study.course, name), np.dtype(plan.precision))
+        for name in ("motion", "noise", "turned", "energy")
+    }
+    course = study.course._replace(**precise)
+    sums = _Sums(study, plan.chunk)
+    for k, track in enumerate(walk(study.config, sets, course, study.chosen)):
+        sums.add(k * SEGMENT, track)
+    return {name: column[:count] for name, column in sums.scores().items()}
 
 
-def _save_scores(scores: _SetScores, path: Path) -> None:
+def _save_scores(scores: _Scores, path: Path) -> None:
     """Writes the scores of a chunk; they are on the disk when this returns."""
-    np.savez_compressed(path, **scores._asdict())
+    np.savez_compressed(path, **scores)  # type: ignore[arg-type]
     flush_to_disk(path)
 
 
@@ -322,7 +276,7 @@ def _draw_scores(
     rows = -(-len(parameters) // _COLUMNS)
     height = style.TOP + rows * (_PANEL + _GAP_UP)
     figure = style.new_figure(height, title, line)
-    width = (WIDTH - style.LEFT - style.RIGHT - (_COLUMNS - 1) * _GAP_ACROSS) / _COLUMNS
+    width = (style.INNER - (_COLUMNS - 1) * _GAP_ACROSS) / _COLUMNS
     for k, (name, values) in enumerate(parameters.items()):
         row, column = divmod(k, _COLUMNS)
         left = style.LEFT + column * (width + _GAP_ACROSS)
@@ -353,7 +307,7 @@ def _draw_rate_maps(
             [W + 1], [H + 1] edges of the place bins, m.
     """
     columns = max(map(len, rows.values()))
-    side = (WIDTH - style.LEFT - style.RIGHT - (columns - 1) * _MAP_GAP) / columns
+    side = (style.INNER - (columns - 1) * _MAP_GAP) / columns
     step = side + 0.5
     height = style.TOP + len(rows) * step + 0.1
     figure = style.new_figure(height, title, line)
@@ -383,7 +337,7 @@ decoding: mean distance on the torus. reseeded: share of steps at which activity
 of steps that needed more than the smallest window. Rank correlations are Spearman's, over all sets."""
 
 
-def render_cells(study: _CellStudy, scores: _SetScores) -> str:
+def render_cells(study: _CellStudy, scores: _Scores) -> str:
     """Best, median and worst set by drift, and the rank correlations, as Markdown."""
     table = [["", "set", *(f"{name} {unit}".strip() for name, unit in UNITS.items())]]
     columns = _columns(study, scores)
@@ -400,61 +354,47 @@ def render_cells(study: _CellStudy, scores: _SetScores) -> str:
     return "\n".join([render_table(table), "", render_table(links), "", NOTE, _describe(study)])
 
 
-def save_cells(study: _CellStudy, scores: _SetScores, folder: Path) -> list[Path]:
+def save_cells(study: _CellStudy, scores: _Scores, folder: Path) -> list[Path]:
     """Writes table.csv with all sets, table.md, maps.npz with all rate maps, and the pictures drift.png,
     decoding.png and maps.png."""
-    columns = _columns(study, scores)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["set", *columns])
-    writer.writerows(
-        [k, *(repr(float(column[k])) for column in columns.values())] for k in range(len(scores.drift))
-    )
-    write_text_atomically(folder / "table.csv", text.getvalue())
-    write_text_atomically(folder / "table.md", f"{render_cells(study, scores)}\n")
-    course = study.course
-    write_atomically(
-        folder / "maps.npz",
-        lambda path: np.savez_compressed(
-            path, maps=scores.maps, cell=course.chosen, x_edges=course.x_edges, y_edges=course.y_edges
-        ),
-    )
-    paths = [folder / name for name in ("table.csv", "table.md", "maps.npz")]
-    for name, figure in _figures(study, scores).items():
-        write_atomically(folder / name, figure.savefig)
-        paths.append(folder / name)
-    return paths
-
-
-def _figures(study: _CellStudy, scores: _SetScores) -> dict:
-    columns, line = _columns(study, scores), _describe(study)
-    parameters = {f"{name} ({UNITS[name]})".removesuffix(" ()"): columns[name] for name in PARAMETERS}
-    rows = {name: scores.maps[k] for name, k in _chosen(scores).items()}
-    course = study.course
-    return {
-        "drift.png": _draw_scores(f"Drift: {study.name}", line, parameters, scores.drift, "drift, rms (m)"),
-        "decoding.png": _draw_scores(
-            f"Decoding error: {study.name}", line, parameters, scores.decoding, "decoding error (m)"
-        ),
-        "maps.png": _draw_rate_maps(
-            f"Rate maps by drift: {study.name}",
-            f"Least, median and most drift of {len(scores.drift)} sets; above each map its largest activity",
-            rows,
-            course.x_edges,
-            course.y_edges,
-        ),
+    columns, course = _columns(study, scores), study.course
+    rows = [{name: float(column[k]) for name, column in columns.items()} for k in range(len(scores["drift"]))]
+    arrays: dict[str, Any] = {"maps": scores["maps"], "cell": course.chosen}
+    arrays |= {"x_edges": course.x_edges, "y_edges": course.y_edges}
+    files = {
+        "table.csv": csv_text([{"set": k} | row for k, row in enumerate(rows)]),
+        "table.md": f"{render_cells(study, scores)}\n",
+        "maps.npz": partial(np.savez_compressed, **arrays),
     }
+    return save_files(folder, files | _figures(study, scores))
 
 
-def _chosen(scores: _SetScores) -> dict[str, int]:
+def _figures(study: _CellStudy, scores: _Scores) -> dict[str, style.Figure]:
+    columns, line, course = _columns(study, scores), _describe(study), study.course
+    parameters = {f"{name} ({UNITS[name]})".removesuffix(" ()"): columns[name] for name in PARAMETERS}
+    rows = {name: scores["maps"][k] for name, k in _chosen(scores).items()}
+    drift, decoding = (
+        _draw_scores(f"{what}: {study.name}", line, parameters, scores[name], label)
+        for name, what, label in (
+            ("drift", "Drift", "drift, rms (m)"),
+            ("decoding", "Decoding error", "decoding error (m)"),
+        )
+    )
+    sets = f"Least, median and most drift of {len(scores['drift'])} sets; above each map its largest activity"
+    title = f"Rate maps by drift: {study.name}"
+    maps = _draw_rate_maps(title, sets, rows, course.x_edges, course.y_edges)
+    return {"drift.png": drift, "decoding.png": decoding, "maps.png": maps}
+
+
+def _chosen(scores: _Scores) -> dict[str, int]:
     """Indices of the best, the median and the worst set by drift."""
-    order = np.argsort(scores.drift, kind="stable")
+    order = np.argsort(scores["drift"], kind="stable")
     return {"best": int(order[0]), "median": int(order[len(order) // 2]), "worst": int(order[-1])}
 
 
-def _columns(study: _CellStudy, scores: _SetScores) -> dict[str, np.ndarray]:
-    parameters = dict(zip(PARAMETERS, study.parameters.T, strict=True))
-    return {name: parameters[name] if name in parameters else getattr(scores, name) for name in UNITS}
+def _columns(study: _CellStudy, scores: _Scores) -> dict[str, np.ndarray]:
+    known = scores | dict(zip(PARAMETERS, study.parameters.T, strict=True))
+    return {name: known[name] for name in UNITS}
 
 
 def _describe(study: _CellStudy) -> str:

@@ -29,6 +29,8 @@ CELLS = "cells"
 """Preset that simulates many networks of pose cells."""
 PRESETS = ("ablate", "vary", "spread", "tiers", "backends", "pareto", GROWTH, CELLS)
 """Names of presets, known before JAX is loaded."""
+REFUSED = {GROWTH: ("search", "workers", "scheduler", "error"), CELLS: ("search", "error")}
+"""Options that do not suit a preset."""
 CYCLES = 800
 """Cycles of the session that `size` tries settings on."""
 FEWEST_CYCLES = 50
@@ -122,27 +124,34 @@ class _Progress:
         return INPUT_ERROR if self.failed else 0
 
 
-def _limit_threads() -> None:
-    """Limits NumPy to one thread in this process and its workers, so that results are equal.
+def _prepare() -> None:
+    """Prepares JAX; limits NumPy to one thread in this process and its workers, so that results are equal.
 
     Call it before NumPy is loaded.
     """
     for name in THREADS:
         os.environ.setdefault(name, "1")
+    prepare_jax()
 
 
 def _study(arguments: argparse.Namespace) -> int:
-    _limit_threads()
-    prepare_jax()
+    _prepare()
+    for option in REFUSED.get(arguments.preset, ()):
+        if getattr(arguments, option):
+            preset = arguments.preset
+            expected = "no search" if preset == CELLS else "one session at a time, without search"
+            raise InputError(f"--{option}", f"with --preset {preset}", expected, "leave it out")
     if arguments.preset == GROWTH:
         return _growth(arguments)
     if arguments.preset == CELLS:
         return _cells(arguments)
+    from evaluation.studies.executor import Executor
     from evaluation.studies.metrics import find_error
-    from evaluation.studies.parameter_search import search_plan
+    from evaluation.studies.parameter_search import search, search_plan
     from evaluation.studies.presets import preset_study
-    from evaluation.studies.run_job import RunLog
+    from evaluation.studies.run_job import RunLog, measure_jobs, run_jobs
     from evaluation.studies.study import read_study
+    from evaluation.studies.study_report import make_report, render, save_report
 
     remarks: list[str] = []
     if arguments.preset:
@@ -150,13 +159,30 @@ def _study(arguments: argparse.Namespace) -> int:
         study, remarks = preset_study(arguments.preset, config, arguments.set, **changes)
     else:
         study = read_study(find_config(arguments.config), arguments.set)
-    error = find_error(arguments.error) if arguments.error else None
-    if arguments.search:
-        search_plan(study)
+    error, plan = find_error(arguments.error) if arguments.error else None, study.plan
+    runs = len({job.key for job in study.jobs})
+    if searching := arguments.search:
+        runs = search_plan(study).trials * len(plan.every_seed()) * max(plan.copies, 1)
+    alone = plan.report == "pareto" and arguments.scheduler is None and arguments.workers in (None, 1)
     log = RunLog(_folder(arguments, study.name, "runs.jsonl"))
-    return (
-        _search(arguments, study, log) if arguments.search else _table(arguments, study, log, error, remarks)
-    )
+    with _Progress(runs, log.path) as progress, Executor(arguments.workers, arguments.scheduler) as executor:
+        if searching:
+            records = search(study, log, executor, progress)
+        elif alone:
+            records = measure_jobs(study.jobs, log, progress)
+        else:
+            records = list(run_jobs(study.jobs, log, executor, progress))
+    report = make_report(study.name, plan, records, error, searching)
+    report = replace(report, remarks=[*report.remarks, *remarks])
+    paths = save_report(report, log.path.parent)
+    print(render(report))
+    print(f"\n{log.path} holds every run, {', '.join(path.name for path in paths)} the table")
+    if not searching:
+        return progress.report_failures()
+    if any(row.optimal for row in report.rows):
+        return 0
+    print("ratslam: error: no trial has a value of every objective", file=sys.stderr)
+    return progress.report_failures() or INPUT_ERROR
 
 
 def _folder(arguments: argparse.Namespace, name: str, mark: str) -> Path:
@@ -166,30 +192,7 @@ def _folder(arguments: argparse.Namespace, name: str, mark: str) -> Path:
     return folder
 
 
-def _table(arguments: argparse.Namespace, study: Any, log: Any, error: Any, remarks: list[str]) -> int:
-    from evaluation.studies.executor import Executor
-    from evaluation.studies.run_job import measure_jobs, run_jobs
-    from evaluation.studies.study_report import make_report
-
-    jobs = study.jobs
-    alone = study.plan.report == "pareto" and arguments.scheduler is None and arguments.workers in (None, 1)
-    with (
-        _Progress(len({job.key for job in jobs}), log.path) as progress,
-        Executor(arguments.workers, arguments.scheduler) as executor,
-    ):
-        records = (
-            measure_jobs(jobs, log, progress) if alone else list(run_jobs(jobs, log, executor, progress))
-        )
-    report = make_report(study.name, study.plan, records, error)
-    _save(replace(report, remarks=[*report.remarks, *remarks]), log.path)
-    return progress.report_failures()
-
-
 def _growth(arguments: argparse.Namespace) -> int:
-    for option in ("search", "workers", "scheduler", "error"):
-        if getattr(arguments, option):
-            found = f"with --preset {GROWTH}"
-            raise InputError(f"--{option}", found, "one session at a time, without search", "leave it out")
     from evaluation.studies.growth import growth_study, read_rows, render_growth, run_growth, save_growth
 
     name, tasks = growth_study(find_config(arguments.config), arguments.set)
@@ -206,16 +209,7 @@ def _growth(arguments: argparse.Namespace) -> int:
 
 
 def _cells(arguments: argparse.Namespace) -> int:
-    for option in ("search", "error"):
-        if getattr(arguments, option):
-            raise InputError(f"--{option}", f"with --preset {CELLS}", "no search", "leave it out")
-    from evaluation.studies.cell_study import (
-        FOLDER,
-        cell_study,
-        render_cells,
-        run_cell_study,
-        save_cells,
-    )
+    from evaluation.studies.cell_study import FOLDER, cell_study, render_cells, run_cell_study, save_cells
     from evaluation.studies.executor import Executor
 
     study = cell_study(find_config(arguments.config), arguments.set)
@@ -231,39 +225,10 @@ def _cells(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _save(report: Any, records: Path) -> None:
-    from evaluation.studies.study_report import render, save_report
-
-    paths = save_report(report, records.parent)
-    print(render(report))
-    print(f"\n{records} holds every run, {', '.join(path.name for path in paths)} the table")
-
-
-def _search(arguments: argparse.Namespace, study: Any, log: Any) -> int:
-    from evaluation.studies.executor import Executor
-    from evaluation.studies.parameter_search import search
-    from evaluation.studies.study_report import make_report
-
-    plan = study.plan.tune
-    runs = len(study.plan.every_seed()) * max(study.plan.copies, 1)
-    with (
-        _Progress(plan.trials * runs, log.path) as progress,
-        Executor(arguments.workers, arguments.scheduler) as executor,
-    ):
-        records = search(study, log, executor, progress)
-    report = make_report(study.name, study.plan, records, search=True)
-    _save(report, log.path)
-    if any(row.optimal for row in report.rows):
-        return 0
-    print("ratslam: error: no trial has a value of every objective", file=sys.stderr)
-    return progress.report_failures() or INPUT_ERROR
-
-
 def _size(arguments: argparse.Namespace) -> int:
     if arguments.cycles < FEWEST_CYCLES:
         raise InputError("--cycles", str(arguments.cycles), f"{FEWEST_CYCLES} or more")
-    _limit_threads()
-    prepare_jax()
+    _prepare()
     from evaluation.studies.recommendation import (
         changed_settings_yaml,
         recommend,

@@ -8,8 +8,6 @@ growing lengths; every row is on disk as soon as it is measured.
 
 from __future__ import annotations
 
-import csv
-import io
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -26,7 +24,7 @@ from pydantic import Field, PositiveInt
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import ate
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, GREEN, PURPLE, VERMILLION, WIDTH
+from evaluation.plots.style import BLUE, GREEN, PURPLE, VERMILLION
 from evaluation.studies.executor import Executor
 from evaluation.studies.machine import (
     Machine,
@@ -36,27 +34,27 @@ from evaluation.studies.machine import (
     reset_peak_memory,
     watch_load,
 )
-from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE
+from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE, closure_errors
 from evaluation.studies.perturbation import repeat_course
-from evaluation.studies.run_job import KILLED
-from evaluation.studies.study import with_settings
+from evaluation.studies.run_job import KILLED, read_records
+from evaluation.studies.study import preset_settings, with_settings
 from evaluation.studies.study_report import (
+    csv_text,
     describe_machines,
     find_disturbances,
     format_number,
     render_table,
+    save_files,
 )
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.settings.run_config import RunConfig
-from ratslam.runs.settings.strict_yaml import Document, load, override, validate
-from ratslam.runs.settings.yaml_document import Place
+from ratslam.runs.settings.strict_yaml import load, override, validate
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.sources.in_memory import load_into_memory
 from robot.world.maze import winding_loop
 from robot.world.scene import PAPER_CIRCUITS, PathConfig
 from tactile.base.errors import InputError, os_errors_of
-from tactile.base.files import write_atomically, write_text_atomically
 from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
 from tactile.base.settings import Settings
@@ -75,7 +73,7 @@ Ground = Literal["known ground", "new ground"]
 Length = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
-class GrowthPlan(Settings):
+class _GrowthPlan(Settings):
     """The settings of a growth study."""
 
     first: PositiveInt = 400  # least length to measure at, steps; each further one is twice as long
@@ -93,36 +91,34 @@ class GrowthPlan(Settings):
         return [*found, most] if most else []
 
 
-class GrowthTask(NamedTuple):
+class _GrowthTask(NamedTuple):
     """One session of a growth study."""
 
     ground: Ground
     config: RunConfig  # a simulation of whiskers is at least as long as the greatest length
     lengths: list[int]  # to measure at, increasing, steps
-    window: int = 0  # see `GrowthPlan`
+    window: int = 0  # see `_GrowthPlan`
 
 
-def growth_study(path: Path, overrides: Sequence[str] = ()) -> tuple[str, list[GrowthTask]]:
+def growth_study(path: Path, overrides: Sequence[str] = ()) -> tuple[str, list[_GrowthTask]]:
     """Name and sessions of the growth study of a configuration file.
 
     Args:
-        overrides: each `a.b=value`: a key of `GrowthPlan` where it is one, else of the configuration.
+        overrides: each `a.b=value`: a key of `_GrowthPlan` where it is one, else of the configuration.
 
     Raises:
         InputError: the configuration is invalid, or the ground is too small.
     """
-    own = [text for text in overrides if text.partition("=")[0] in GrowthPlan.model_fields]
-    empty = Document({}, {(): Place("--preset growth", "--preset growth")})
-    plan = validate(override(empty, own), GrowthPlan)
-    document = override(load(path), [text for text in overrides if text not in own])
+    plan, others = preset_settings(_GrowthPlan, "growth", overrides)
+    document = override(load(path), others)
     config = validate(document, RunConfig).with_absolute_paths(path.parent.resolve())
     whiskers = config.simulation is not None
     tasks = []
     if lengths := plan.lengths("known ground"):
         known = _with_laps(config, lengths[-1]) if whiskers else config
-        tasks.append(GrowthTask("known ground", known, lengths, plan.window))
+        tasks.append(_GrowthTask("known ground", known, lengths, plan.window))
     if whiskers and (lengths := plan.lengths("new ground")):
-        tasks.append(GrowthTask("new ground", with_new_ground(config, lengths[-1]), lengths, plan.window))
+        tasks.append(_GrowthTask("new ground", with_new_ground(config, lengths[-1]), lengths, plan.window))
     if not tasks:
         raise InputError("--preset growth", "no session", "known_ground or new_ground above 0 steps")
     return f"{path.stem}-growth", tasks
@@ -131,16 +127,13 @@ def growth_study(path: Path, overrides: Sequence[str] = ()) -> tuple[str, list[G
 def _with_laps(config: RunConfig, steps: int) -> RunConfig:
     """The configuration with its circuits repeated for at least so many steps."""
     assert config.simulation is not None
-    word = config.simulation.path.circuits or PAPER_CIRCUITS
-    laps, loop = 1, config.simulation.path.loop
+    word, loop = config.simulation.path.circuits or PAPER_CIRCUITS, config.simulation.path.loop
 
-    def repeated() -> RunConfig:
+    def repeated(laps: int) -> RunConfig:
         circuits = (word * ceil(laps / len(word)))[:laps]
         return with_settings(config, {"simulation.path": PathConfig(circuits=circuits, loop=loop)})
 
-    while (length := _length(found := repeated())) < steps:
-        laps = max(laps + 1, ceil(SPARE * laps * steps / length))
-    return found
+    return _lengthened(repeated, 1, steps)
 
 
 def with_new_ground(config: RunConfig, steps: int) -> RunConfig:
@@ -151,15 +144,23 @@ def with_new_ground(config: RunConfig, steps: int) -> RunConfig:
     maze = config.simulation.maze.model_copy(update=size)
     seed = config.simulation.seed if maze.seed is None else maze.seed
     loop = tuple(winding_loop(SIDE, SIDE, stream(seed, "growth.route")))
-    cells = 8
-    while True:
+
+    def visiting(cells: int) -> RunConfig:
         path = PathConfig(cells=loop[:cells], loop=loop)
-        found = with_settings(config, {"simulation.maze": maze, "simulation.path": path})
-        if (length := _length(found)) >= steps:
-            return found
-        if cells == len(loop):
+        return with_settings(config, {"simulation.maze": maze, "simulation.path": path})
+
+    return _lengthened(visiting, 8, steps, len(loop))
+
+
+def _lengthened(
+    made: Callable[[int], RunConfig], count: int, steps: int, most: int = sys.maxsize
+) -> RunConfig:
+    """What is made of a number of laps or cells, from `count` on, that suffices for so many steps."""
+    while (length := _length(found := made(count))) < steps:
+        if count == most:
             raise InputError("new_ground", f"{steps} steps", f"at most {length}, a visit of every cell")
-        cells = min(max(cells + 1, ceil(SPARE * cells * steps / length)), len(loop))
+        count = min(max(count + 1, ceil(SPARE * count * steps / length)), most)
+    return found
 
 
 def _length(config: RunConfig) -> int:
@@ -183,7 +184,7 @@ TIMES = ("mean", "process_mean", "median", "p99", "largest", "longest")
 
 class _GrowthRow(Settings):
     """A session at one length. Times are of the steps since the length before, or of the window of
-    `GrowthPlan`, without those that compiled code; None if all did. Errors are of all steps so far."""
+    `_GrowthPlan`, without those that compiled code; None if all did. Errors are of all steps so far."""
 
     ground: Ground
     steps: int  # length of the session
@@ -251,7 +252,7 @@ class _StepClock:
         self._compiling, self._others, self._began = 0.0, 0.0, _read_clocks()
 
 
-def measure_growth(task: GrowthTask, done: Callable[[], object] = lambda: None) -> Iterator[_GrowthRow]:
+def measure_growth(task: _GrowthTask, done: Callable[[], object] = lambda: None) -> Iterator[_GrowthRow]:
     """Plays the session once, to its greatest length; yields a row at each length.
 
     Args:
@@ -292,12 +293,11 @@ def _errors(session: Session, truth: np.ndarray, odometry: np.ndarray) -> dict[s
     began = thread_time()
     final, end = session.map.trajectory(), thread_time() - began
     closures = session.map.closures()
-    apart = np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
     return {
         "end": end,
         "energy_odometry": energy_all_pairs(odometry, truth).total,
         "closures": len(closures),
-        "false_closures": int((apart > FALSE_CLOSURE_DISTANCE).sum()),
+        "false_closures": int((closure_errors(truth, closures) > FALSE_CLOSURE_DISTANCE).sum()),
         "energy": energy_all_pairs(online, truth).total,
         "ate": ate(online, truth),
         "energy_final": energy_all_pairs(final, truth).total,
@@ -323,7 +323,7 @@ optimisation if the session ended here. final, closures, false: of the map after
 than 0.1 m apart."""
 
 
-def run_growth(tasks: Sequence[GrowthTask], folder: Path) -> None:
+def run_growth(tasks: Sequence[_GrowthTask], folder: Path) -> None:
     """Runs sessions one after another; each row is in `folder/FILE` as soon as it is measured.
 
     Raises:
@@ -341,13 +341,7 @@ def run_growth(tasks: Sequence[GrowthTask], folder: Path) -> None:
 
 def read_rows(folder: Path) -> list[_GrowthRow]:
     """The rows measured so far."""
-    path, found = folder / FILE, []
-    for line in path.read_bytes().splitlines() if path.exists() else []:
-        try:
-            found.append(_GrowthRow.model_validate_json(line))
-        except ValueError:  # cut off by a kill
-            continue
-    return found
+    return read_records(folder / FILE, _GrowthRow)
 
 
 def render_growth(rows: Sequence[_GrowthRow]) -> str:
@@ -374,10 +368,7 @@ def _draw(name: str, rows: Sequence[_GrowthRow]) -> Figure | None:
     steps = np.array([row.steps for row in timed])
     measured = describe_machines([row.machine for row in rows], 1)
     line = "  ·  ".join(measured[part] for part in ("machine", "build"))
-    inner = WIDTH - style.LEFT - style.RIGHT
-    title = f"Cost of a step against length: {name}"
-    figure = style.new_figure(style.TOP + _TALL + _BOTTOM, title, line)
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, _TALL)
+    figure, axes = style.new_chart(_TALL, _BOTTOM, f"Cost of a step against length: {name}", line)
     style.log_axes(axes, steps, cost.ravel())
     for ground, color in zip(grounds, _COLORS, strict=False):
         these = [row.ground == ground for row in timed]
@@ -394,22 +385,11 @@ def _draw(name: str, rows: Sequence[_GrowthRow]) -> Figure | None:
 def save_growth(name: str, rows: Sequence[_GrowthRow], folder: Path) -> list[Path]:
     """Writes table.csv, table.md and, if there is something to draw, growth.png."""
     lines = [row.model_dump(exclude={"machine"}) | {"other_load": row.machine.other_load} for row in rows]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    write_text_atomically(folder / "table.csv", text.getvalue())
-    write_text_atomically(folder / "table.md", f"{render_growth(rows)}\n")
-    paths, picture = [folder / "table.csv", folder / "table.md"], folder / "growth.png"
-    figure = _draw(name, rows)
-    if figure is None:
-        picture.unlink(missing_ok=True)  # of an earlier call
-        return paths
-    write_atomically(picture, figure.savefig)
-    return [*paths, picture]
+    figure, table = _draw(name, rows), f"{render_growth(rows)}\n"
+    return save_files(folder, {"table.csv": csv_text(lines), "table.md": table, "growth.png": figure})
 
 
-def _append_rows(path: Path, task: GrowthTask) -> str | None:
+def _append_rows(path: Path, task: _GrowthTask) -> str | None:
     """Measures a session, with a progress bar; appends its rows to a file."""
     from tqdm import tqdm
 

@@ -15,37 +15,32 @@ import numpy as np
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.exm import ExmConfig, ExperienceMetric, experience_metric
-from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
+from evaluation.metrics.metric import Finding, Metric, Quantity
 from evaluation.metrics.occupancy_score import GRID_METRICS
 from evaluation.metrics.run_metrics import RUN_METRICS
 from evaluation.metrics.statistics import auc
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 
-
-def _metric(name: str, label: str, unit: str = "", direction: Direction = "low") -> Metric:
-    return Metric(name, label, unit, direction, "Study", lambda _: None)
-
-
 MEASURED = (
-    _metric("step_time", "time per step, median", "us"),
-    _metric("step_time_p99", "time per step, 99 % quantile", "us"),
-    _metric("run_time", "time per step with simulation, sensing and scoring", "us"),
-    _metric("compile_time", "time of compilation", "s"),
-    _metric("memory", "peak memory", "MiB"),
+    Metric("step_time", "time per step, median", "us", "low", "Study"),
+    Metric("step_time_p99", "time per step, 99 % quantile", "us", "low", "Study"),
+    Metric("run_time", "time per step with simulation, sensing and scoring", "us", "low", "Study"),
+    Metric("compile_time", "time of compilation", "s", "low", "Study"),
+    Metric("memory", "peak memory", "MiB", "low", "Study"),
 )
 """Quantities that depend on the machine and its load."""
 STUDY_METRICS = (
-    _metric("recognition_error", "steps not recognised correctly, 1 - ARR x ARCR"),
-    _metric("map_error", "map error, eq. 6"),
-    _metric("error_online", "position error, online", "m"),
-    _metric("error_final", "position error, final", "m"),
-    _metric("closures", "loop closures", "", None),
-    _metric("false_closures", "false loop closures"),
-    _metric("lost_share", "share of steps lost"),
-    _metric("simulation_time", "simulation per second", "us"),
-    _metric("contact_difference", "contact pixels unlike the reference tier"),
-    _metric("height_difference", "height unlike the reference tier", "mm"),
+    Metric("recognition_error", "steps not recognised correctly, 1 - ARR x ARCR", "", "low", "Study"),
+    Metric("map_error", "map error, eq. 6", "", "low", "Study"),
+    Metric("error_online", "position error, online", "m", "low", "Study"),
+    Metric("error_final", "position error, final", "m", "low", "Study"),
+    Metric("closures", "loop closures", "", None, "Study"),
+    Metric("false_closures", "false loop closures", "", "low", "Study"),
+    Metric("lost_share", "share of steps lost", "", "low", "Study"),
+    Metric("simulation_time", "simulation per second", "us", "low", "Study"),
+    Metric("contact_difference", "contact pixels unlike the reference tier", "", "low", "Study"),
+    Metric("height_difference", "height unlike the reference tier", "mm", "low", "Study"),
 )
 """Quantities of a run beside those of its scorecard."""
 METRICS = {metric.name: metric for metric in (*RUN_METRICS, *GRID_METRICS, *STUDY_METRICS, *MEASURED)}
@@ -156,16 +151,15 @@ def touch_metrics(result: SessionResult, exm: ExmConfig | None = None) -> TouchM
         arcr_chain_free=metric.arcr_chain_free if metric else np.nan,
         relocalisations=metric.relocalisations if metric else 0,
         closures=len(result.closures),
-        false_closures=int((closure_errors(result) > FALSE_CLOSURE_DISTANCE).sum()),
+        false_closures=int((closure_errors(truth, result.closures) > FALSE_CLOSURE_DISTANCE).sum()),
         experiences=len(result.node),
         steps=len(truth),
     )
 
 
-def closure_errors(result: SessionResult) -> np.ndarray:
-    """[K] true distance between the two steps of each closure, m."""
-    later, earlier = result.truth[result.closures[:, 0]], result.truth[result.closures[:, 1]]
-    return np.hypot(*(later - earlier)[:, :2].T)
+def closure_errors(truth: np.ndarray, closures: np.ndarray) -> np.ndarray:
+    """[K] true distance between the two steps of each closure [K, 2], m, by true poses [T, 3]."""
+    return np.hypot(*(truth[closures[:, 0]] - truth[closures[:, 1]])[:, :2].T)
 
 
 def experience_metric_if_defined(

@@ -2,14 +2,14 @@
 
 Each copy is drawn from one seed: `perturb` changes start, noise, views and place labels a little, as another
 drive would, and `repeat_course` makes one long drive of it; `miscalibrate` gives the odometry errors that
-last; `lose_labels`, `mistake_labels` and `rename_labels` spoil a third of the given place labels and nothing
-else.
+last; `spoil_labels` spoils a third of the given place labels and nothing else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -86,7 +86,13 @@ def _add_noise(log: InMemorySource, stream: np.random.Generator) -> InMemorySour
     motion[:, 2] += moving * TURN_NOISE / np.sqrt(apart) * stream.standard_normal(len(motion))
     noise = VIEW_NOISE * stream.standard_normal(log.views.shape)
     views = np.where(log.seen[:, None, None, None], np.clip(log.views + noise, 0, 1), log.views)
-    return replace(log, motion=motion, views=views, label=corrupt_labels(log.label, stream))
+    # Some labels are replaced by new labels, and some by labels of other rows.
+    given = np.flatnonzero(log.label >= 0)
+    label, chance = log.label.copy(), stream.random(len(given))
+    new, wrong = given[chance < NEW_IDS], given[(chance >= NEW_IDS) & (chance < NEW_IDS + WRONG_IDS)]
+    label[wrong] = stream.permutation(label[given])[: len(wrong)]
+    label[new] = label.max(initial=0) + 1 + np.arange(len(new))
+    return replace(log, motion=motion, views=views, label=label)
 
 
 def miscalibrate(log: InMemorySource, seed: int) -> InMemorySource:
@@ -110,43 +116,23 @@ def miscalibrate(log: InMemorySource, seed: int) -> InMemorySource:
     return _drop_rows(changed, first, MISCALIBRATED_DROPPED, stream)
 
 
-def lose_labels(log: InMemorySource, seed: int) -> InMemorySource:
-    """A copy in which a third of the place labels are missing."""
+def spoil_labels(log: InMemorySource, seed: int, kind: Literal["lost", "wrong", "new"]) -> InMemorySource:
+    """A copy in which a third of the place labels are lost, or wrong: those of other places of the recording
+    (with a single place none are), or a third of those at places known by then are new: never used before."""
     stream, label = np.random.default_rng(seed), log.label.copy()
-    label[_draw_share(np.flatnonzero(label >= 0), stream)] = -1
-    return replace(log, digest=f"{log.digest}+lost {seed}", label=label)
-
-
-def mistake_labels(log: InMemorySource, seed: int) -> InMemorySource:
-    """A copy in which a third of the place labels are those of other places of the recording; with a single
-    place none are."""
-    stream, label = np.random.default_rng(seed), log.label.copy()
-    places = np.unique(label[label >= 0])
-    chosen = _draw_share(np.flatnonzero(label >= 0), stream)
-    if len(places) > 1:
+    given = np.flatnonzero(label >= 0)
+    places, first = np.unique(label[given], return_index=True)
+    if kind == "new":
+        given = np.setdiff1d(given, given[first])
+    chosen = np.sort(stream.permutation(given)[: round(SPOILT_LABELS * len(given))])
+    if kind == "lost":
+        label[chosen] = -1
+    elif kind == "new":
+        label[chosen] = label.max(initial=0) + 1 + np.arange(len(chosen))
+    elif len(places) > 1:
         others = stream.integers(1, len(places), len(chosen))
         label[chosen] = places[(np.searchsorted(places, label[chosen]) + others) % len(places)]
-    return replace(log, digest=f"{log.digest}+wrong {seed}", label=label)
-
-
-def rename_labels(log: InMemorySource, seed: int) -> InMemorySource:
-    """A copy in which a third of the place labels at places known by then are labels never used before."""
-    stream, label = np.random.default_rng(seed), log.label.copy()
-    given = np.flatnonzero(label >= 0)
-    first = given[np.unique(label[given], return_index=True)[1]]
-    chosen = _draw_share(np.setdiff1d(given, first), stream)
-    label[chosen] = label.max(initial=0) + 1 + np.arange(len(chosen))
-    return replace(log, digest=f"{log.digest}+new {seed}", label=label)
-
-
-def corrupt_labels(label: np.ndarray, stream: np.random.Generator) -> np.ndarray:
-    """Labels [N], some replaced by new labels and some by labels of other rows."""
-    given = np.flatnonzero(label >= 0)
-    label, chance = label.copy(), stream.random(len(given))
-    new, wrong = given[chance < NEW_IDS], given[(chance >= NEW_IDS) & (chance < NEW_IDS + WRONG_IDS)]
-    label[wrong] = stream.permutation(label[given])[: len(wrong)]
-    label[new] = label.max(initial=0) + 1 + np.arange(len(new))
-    return label
+    return replace(log, digest=f"{log.digest}+{kind} {seed}", label=label)
 
 
 def _looks(log: InMemorySource) -> np.ndarray:
@@ -158,11 +144,6 @@ def _draw_start(looks: np.ndarray, stream: np.random.Generator) -> int:
     """The first row of a copy."""
     low, high = START
     return int(looks[min(int(stream.integers(low, high + 1)), len(looks) - 1)]) if len(looks) else 0
-
-
-def _draw_share(rows: np.ndarray, stream: np.random.Generator) -> np.ndarray:
-    """A random third of some rows, in order."""
-    return np.sort(stream.permutation(rows)[: round(SPOILT_LABELS * len(rows))])
 
 
 def _drop_rows(log: InMemorySource, first: int, share: float, stream: np.random.Generator) -> InMemorySource:

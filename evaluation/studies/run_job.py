@@ -7,14 +7,13 @@ of an executor, or, where their speed is compared, one at a time on one core.
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -37,7 +36,7 @@ from evaluation.studies.machine import (
     reset_peak_memory,
     watch_load,
 )
-from evaluation.studies.metrics import quantity
+from evaluation.studies.metrics import closure_errors, quantity
 from evaluation.studies.perturbation import perturb
 from evaluation.studies.scene_statistics import compare_with_tier
 from evaluation.studies.study import Job, run_key
@@ -51,6 +50,7 @@ from tactile.base.errors import InputError, os_errors_of
 from tactile.base.se2 import integrate
 from tactile.base.settings import Settings
 
+Record = TypeVar("Record", bound=Settings)
 FILE = "runs.jsonl"  # name of the file of records in a study's directory
 
 
@@ -89,6 +89,15 @@ def _record_of(job: Job, error: str | None = None, machine: Machine | None = Non
     return RunRecord(**names, error=error, machine=machine)
 
 
+def read_records(path: Path, record: type[Record]) -> list[Record]:
+    """The records in a file, one a line, without a line that a kill cut off; none without the file."""
+    found = []
+    for line in path.read_bytes().splitlines() if path.exists() else []:
+        with suppress(ValueError):
+            found.append(record.model_validate_json(line))
+    return found
+
+
 class RunLog:
     """The records in a directory. A kill loses at most the record that was being written.
 
@@ -100,13 +109,7 @@ class RunLog:
         with os_errors_of(directory, "cannot be made", "a folder to write to"):
             directory.mkdir(parents=True, exist_ok=True)
         self.path = directory / FILE
-        self.records: dict[str, RunRecord] = {}
-        for line in self.path.read_bytes().splitlines() if self.path.exists() else []:
-            try:
-                record = RunRecord.model_validate_json(line)
-            except ValueError:  # cut off by a kill
-                continue
-            self.records[record.key] = record
+        self.records = {record.key: record for record in read_records(self.path, RunRecord)}
 
     def append(self, record: RunRecord) -> None:
         """Adds a record; it is on disk when this returns."""
@@ -167,7 +170,7 @@ def _play(job: Job) -> dict[str, Any]:
         quantities |= quantity("recognition_error", recognition_error(quantities)) | extra
         closures, false = session.map.closures(), np.nan
         if run.truth is not None:
-            apart = np.hypot(*(run.truth[closures[:, 0]] - run.truth[closures[:, 1]])[:, :2].T)
+            apart = closure_errors(run.truth, closures)
             false = int((apart > SAME_PLACE * config.pose_cells.cell_size).sum())
         quantities |= quantity("closures", Finding(len(closures)))
         quantities |= quantity("false_closures", Finding(false))
@@ -218,7 +221,7 @@ def _grid_map(session: Session, source: Source) -> dict[str, Quantity]:
     write, arena = session.map.files().get("grid.npz"), source.info.arena
     if write is None or arena is None:
         return {}
-    with tempfile.TemporaryDirectory() as name:
+    with TemporaryDirectory() as name:
         folder = Path(name)
         write(folder / "grid.npz")
         (folder / "arena.txt").write_text(arena, encoding="utf-8")

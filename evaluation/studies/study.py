@@ -114,7 +114,7 @@ class SearchPlan(Settings):
         return given | dict.fromkeys(self.minimise, "low") | dict.fromkeys(self.maximise, "high")
 
 
-class RowPlan(Settings):
+class _RowPlan(Settings):
     """A row: settings by key path, and beside them two keys of its own."""
 
     model_config = ConfigDict(extra="allow")
@@ -134,7 +134,7 @@ class StudyPlan(Settings):
     base: Path  # configuration of all runs: a path, from the folder of the study file, or a packaged name
     set: dict[str, Any] = Field(default_factory=dict)
     """Settings of all runs, by key path. Relative paths in them start at the base, as its own do."""
-    rows: dict[str, RowPlan | None] = Field(default_factory=dict)
+    rows: dict[str, _RowPlan | None] = Field(default_factory=dict)
     """Named sets of settings to compare, by key path. A row may also hold `copies`, in place of the study's,
     and `ablation`: parts of the keyframe map that are off, such as {verify: false}."""
     vary: dict[str, Values] = Field(default_factory=dict)
@@ -170,17 +170,18 @@ class StudyPlan(Settings):
         """The seeds themselves."""
         return tuple(range(self.seeds)) if isinstance(self.seeds, int) else self.seeds
 
-    def every_row(self) -> dict[str, RowPlan]:
+    def every_row(self) -> dict[str, _RowPlan]:
         """The rows; one without a name where the study has none."""
-        return {name: row or RowPlan() for name, row in (self.rows or {"": None}).items()}
+        return {name: row or _RowPlan() for name, row in (self.rows or {"": None}).items()}
 
-    def every_copy(self, row: RowPlan) -> tuple[int, ...]:
+    def every_copy(self, row: _RowPlan) -> tuple[int, ...]:
         """Seeds of a row's perturbed copies; (0,): the session itself."""
         copies = self.copies if row.copies is None else row.copies
         return tuple(range(1, copies + 1)) or (0,)
 
 
 Model = TypeVar("Model", bound=BaseModel)
+Preset = TypeVar("Preset", bound=Settings)
 MOST = 100_000  # largest number of jobs of a study
 SEEDS = {
     "simulation": "simulation.seed",
@@ -266,7 +267,7 @@ def searched_jobs(study: Study, parameters: dict[str, Any]) -> list[Job]:
     settings: list[_Setting] = [
         (key, value, ("tune", "parameters", key)) for key, value in parameters.items()
     ]
-    return list(_runs_of(study, settings, "tune", RowPlan(), parameters))
+    return list(_runs_of(study, settings, "tune", _RowPlan(), parameters))
 
 
 def _jobs(study: Study) -> Iterator[Job]:
@@ -294,7 +295,7 @@ def _jobs(study: Study) -> Iterator[Job]:
 
 
 def _runs_of(
-    study: Study, settings: Sequence[_Setting], name: str, row: RowPlan, varied: dict[str, Any]
+    study: Study, settings: Sequence[_Setting], name: str, row: _RowPlan, varied: dict[str, Any]
 ) -> Iterator[Job]:
     """The study's base with further settings, under every seed and copy."""
     plan, document = study.plan, study.base
@@ -347,6 +348,14 @@ def _outermost_first(keys: Iterable[str]) -> list[str]:
 def is_study_key(assignment: str) -> bool:
     """Whether `a.b=value` sets a key of the study; else it is a setting of all runs."""
     return assignment.partition("=")[0].split(".")[0] in StudyPlan.model_fields
+
+
+def preset_settings(plan: type[Preset], name: str, overrides: Sequence[str]) -> tuple[Preset, list[str]]:
+    """The settings of a preset that is no study file, and the overrides `a.b=value` of the configuration:
+    those that set no key of the preset."""
+    own = [text for text in overrides if text.partition("=")[0] in plan.model_fields]
+    empty = Document({}, {(): Place(f"--preset {name}", f"--preset {name}")})
+    return validate(override(empty, own), plan), [text for text in overrides if text not in own]
 
 
 def _check_unambiguous(plan: StudyPlan, document: Document, overridden: Collection[str]) -> None:

@@ -80,7 +80,12 @@ def read_course(
         motion, noise, np.maximum(template, 0), template > newest[:-1],
         relative / units(network, np.dtype(float))[2], energy,
     )  # fmt: skip
-    bin, x_edges, y_edges = place_bins(truth, bins)
+    # Flat bins in the smallest square round the path.
+    low, high = truth[:, :2].min(axis=0), truth[:, :2].max(axis=0)
+    side, middle = (high - low).max(), (low + high) / 2
+    edges = middle[:, None] + side * (np.arange(bins + 1) / bins - 0.5)
+    column, row = np.clip(((truth[:, :2] - edges[:, 0]) / side * bins).astype(int), 0, bins - 1).T
+    bin = row * bins + column
     cells = np.array(chosen, np.int32)
     if not chosen:  # the cells nearest to the undisturbed packet at equally spaced times
         at = ((np.arange(CELLS) + 0.5) / CELLS * len(expected)).astype(int)
@@ -89,7 +94,7 @@ def read_course(
     most = network.cells_heading * network.cells_xy**2
     if cells.max() >= most:
         raise InputError("chosen", str(cells.max()), f"indices below {most}, the cells of the network")
-    return StudyCourse(name, network, course, expected, bin, seconds, x_edges, y_edges, cells)
+    return StudyCourse(name, network, course, expected, bin, seconds, edges[0], edges[1], cells)
 
 
 def _read_session(
@@ -153,12 +158,3 @@ def expected_poses(config: PoseCellConfig, truth: np.ndarray) -> np.ndarray:
     heading = np.unwrap(truth[:, 2]) - truth[0, 2]
     gone = np.stack([c * gone[:, 0] - s * gone[:, 1], s * gone[:, 0] + c * gone[:, 1], heading], axis=1)
     return start + gone / unit
-
-
-def place_bins(truth: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """[T] flat bins of positions [T, 3] in the smallest square round them, and its edges in x and y, m."""
-    low, high = truth[:, :2].min(axis=0), truth[:, :2].max(axis=0)
-    side, middle = (high - low).max(), (low + high) / 2
-    edges = middle[:, None] + side * (np.arange(bins + 1) / bins - 0.5)
-    at = np.clip(((truth[:, :2] - edges[:, 0]) / side * bins).astype(int), 0, bins - 1)
-    return at[:, 1] * bins + at[:, 0], edges[0], edges[1]

@@ -23,7 +23,7 @@ import numpy as np
 from evaluation.metrics.metric import Direction
 from evaluation.metrics.statistics import pareto_optimal
 from evaluation.plots import style
-from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION, WIDTH
+from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION
 from evaluation.studies.machine import Machine
 from evaluation.studies.metrics import COLUMNS, DEFAULT_ERRORS, MEASURED, METRICS
 from evaluation.studies.run_job import RunRecord
@@ -81,7 +81,7 @@ def plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[_Row]:
+def _summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[_Row]:
     """A row for each name and combination, in their order; last that of raw odometry if asked for."""
     groups: dict[str, list[RunRecord]] = {}
     for record in records:
@@ -92,14 +92,7 @@ def summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[_Row
     return rows
 
 
-def default_error(rows: Sequence[_Row]) -> str | None:
-    """The first default error that most rows have in all of their runs; None if no row has any."""
-    whole = [name for row in rows for name, found in row.spreads.items() if None not in found.values]
-    best = max(DEFAULT_ERRORS, key=whole.count)
-    return best if best in whole else None
-
-
-def mark_optimal(rows: Sequence[_Row], objectives: Mapping[str, Direction], statistic: str) -> list[_Row]:
+def _mark_optimal(rows: Sequence[_Row], objectives: Mapping[str, Direction], statistic: str) -> list[_Row]:
     """The rows with `optimal` set by the mean or median of each objective.
 
     Only a row whose runs all have all objectives can be optimal.
@@ -172,10 +165,7 @@ def draw_pareto(title: str, line: str, marks: Sequence[ParetoPoint], time: str, 
     Args:
         marks: at least one point. time, error: axis labels with units.
     """
-    inner = WIDTH - style.LEFT - style.RIGHT
-    tall = _TALL + _EACH * max(0, len(marks) - 12)
-    figure = style.new_figure(style.TOP + tall + _BOTTOM, title, line)
-    axes = style.add_axes(figure, style.LEFT, _BOTTOM, inner, tall)
+    figure, axes = style.new_chart(_TALL + _EACH * max(0, len(marks) - 12), _BOTTOM, title, line)
     spans = np.array([[mark.time, mark.error] for mark in marks])  # [N, 2, 3]
     positive = spans[:, 1][spans[:, 1] > 0]
     floor = _FLOOR * positive.min() if len(positive) else 1.0
@@ -331,13 +321,18 @@ def make_report(
             whether the records are of the trials of a search; then the Pareto-optimal ones are marked.
     """
     kind = "search" if search else plan.report
-    rows = summarise(records, odometry=kind in ("medians", "differences"))
-    error = (error or default_error(rows)) if kind == "pareto" else None
+    rows = _summarise(records, odometry=kind in ("medians", "differences"))
+    if kind != "pareto":
+        error = None
+    elif error is None:  # the first default error that most rows have in all of their runs
+        whole = [name for row in rows for name, found in row.spreads.items() if None not in found.values]
+        first = max(DEFAULT_ERRORS, key=whole.count)
+        error = first if first in whole else None
     columns, remarks = [*COLUMNS.get(kind, ()), *([error] if error else [])], list[str]()
     if error is not None:
-        rows = mark_optimal(rows, {"step_time": "low", error: METRICS[error].direction}, "median")
+        rows = _mark_optimal(rows, {"step_time": "low", error: METRICS[error].direction}, "median")
     if search and plan.tune is not None:
-        columns, rows = [*plan.tune.directions()], mark_optimal(rows, plan.tune.directions(), "mean")
+        columns, rows = [*plan.tune.directions()], _mark_optimal(rows, plan.tune.directions(), "mean")
         best, failed = sum(row.optimal for row in rows), sum(bool(row.failed) for row in rows)
         remarks = [f"{len(rows)} trials, {best} of them Pareto-optimal, {failed} failed"]
     if kind == "differences":
@@ -397,16 +392,42 @@ def _draw(report: _Report) -> Figure | None:
 
 def save_report(report: _Report, directory: Path) -> list[Path]:
     """Writes table.csv, table.json and table.md, and pareto.png where there is something to _draw."""
-    content = json.dumps(asdict(report), indent=1, allow_nan=False) + "\n"
-    paths = [directory / f"table.{kind}" for kind in ("csv", "json", "md")]
-    for path, text in zip(paths, (_csv(report), content, f"{render(report)}\n"), strict=True):
-        write_text_atomically(path, text)
-    picture, figure = directory / "pareto.png", _draw(report)
-    if figure is None:
-        picture.unlink(missing_ok=True)  # of an earlier call
-        return paths
-    write_atomically(picture, figure.savefig)
-    return [*paths, picture]
+    lines, figure = [], _draw(report)
+    for row in report.rows:
+        cells = {name: getattr(row, name) for name in ("row", "runs", "failed", "steps")}
+        cells |= {key: plain(value) for key, value in row.varied.items()} | {"optimal": int(row.optimal)}
+        for name, found in row.spreads.items():
+            cells |= {f"{name}_{part}": value for part, value in asdict(found).items() if part != "values"}
+        lines.append(cells)
+    files = {
+        "table.csv": csv_text(lines),
+        "table.json": json.dumps(asdict(report), indent=1, allow_nan=False) + "\n",
+        "table.md": f"{render(report)}\n",
+        "pareto.png": figure,
+    }
+    return save_files(directory, files)
+
+
+def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows by column as CSV, with the columns of all rows."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(chain.from_iterable(rows))), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def save_files(folder: Path, files: Mapping[str, Any]) -> list[Path]:
+    """Writes texts, figures, and what functions write to a path, into the folder of a study; returns their
+    paths. A file that is None is not written, and that of an earlier call goes."""
+    for name, content in files.items():
+        if content is None:
+            (folder / name).unlink(missing_ok=True)
+        elif isinstance(content, str):
+            write_text_atomically(folder / name, content)
+        else:
+            write_atomically(folder / name, getattr(content, "savefig", content))
+    return [folder / name for name, content in files.items() if content is not None]
 
 
 def _cell(found: _Spread | None, kind: str, base: _Spread | None) -> str:
@@ -494,18 +515,3 @@ def _kept(rows: Sequence[_Row], limit: float | None) -> list[str]:
     finals = [row.spreads.get("ate_final") for row in others]
     kept = sum(final is not None and final.high <= most for final in finals)
     return [f"{kept} of {len(others)} rows ({kept / len(others):.0%}) end at an ATE of {most:.3g} m or less"]
-
-
-def _csv(report: _Report) -> str:
-    lines = []
-    for row in report.rows:
-        cells = {name: getattr(row, name) for name in ("row", "runs", "failed", "steps")}
-        cells |= {key: plain(value) for key, value in row.varied.items()} | {"optimal": int(row.optimal)}
-        for name, found in row.spreads.items():
-            cells |= {f"{name}_{part}": value for part, value in asdict(found).items() if part != "values"}
-        lines.append(cells)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(chain.from_iterable(lines))), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    return text.getvalue()

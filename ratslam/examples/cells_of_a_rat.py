@@ -9,8 +9,8 @@ import numpy as np
 
 from evaluation.cells.head_direction import mean_vector_length
 from evaluation.cells.information import information
-from evaluation.cells.rate_map import arena_edges, bin_activity
-from evaluation.plots.cell_plot import draw_cells, map_sums
+from evaluation.cells.rate_map import arena_edges, bin_activity, rate_maps, tuning_curves
+from evaluation.plots.cell_plot import draw_cells
 from ratslam.classic.config import NetworkConfig
 from ratslam.core.compilation import prepare_precision
 from ratslam.service.rat_agents import DrivenNetwork
@@ -31,15 +31,14 @@ def main() -> None:
         network.advance(motion, pose, energy)
         activity.append(network.activity[CELLS])
     sums = bin_activity(rat.time, rat.truth, np.array(activity), *arena_edges(rat.truth))
-    maps = map_sums(sums, CELLS)
 
-    bits = information(maps.rates, sums.seconds)
-    tuning = mean_vector_length(maps.tuning, sums.heading_seconds)
+    bits = information(rate_maps(sums), sums.seconds)
+    tuning = mean_vector_length(tuning_curves(sums), sums.heading_seconds)
     print(
         f"{len(CELLS)} pose cells: {bits.mean():.2f} bits/spike on place, "
         f"mean vector length {tuning.mean():.2f} over heading"
     )
-    draw_cells("Cells of a rat", maps).savefig("cells_of_a_rat.png")
+    draw_cells("Cells of a rat", sums, CELLS).savefig("cells_of_a_rat.png")
 
 
 if __name__ == "__main__":

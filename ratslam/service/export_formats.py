@@ -17,9 +17,7 @@ import numpy as np
 
 from evaluation.artifacts.grid_files import read_grid, write_nav2
 from evaluation.cells.analysis import (
-    AnalysisSettings,
     CellScores,
-    analyse_all_cells,
     analyse_cells,
     write_scores,
 )
@@ -287,9 +285,7 @@ def _score_cells(directory: Path, peak_rate: float) -> CellScores:
             malformed.
     """
     recording, network = _read_cells(directory)
-    settings = AnalysisSettings(gain=peak_rate / settled_peak(network))
-    analyse = analyse_all_cells if not len(recording.cell) and recording.sums else analyse_cells
-    return analyse(recording, settings)
+    return analyse_cells(recording, peak_rate / settled_peak(network))
 
 
 def _read_cells(directory: Path) -> tuple[CellRecording, NetworkConfig]:

@@ -19,7 +19,7 @@ from evaluation.artifacts.closure_table import read_closure_table
 from evaluation.artifacts.grid_files import Nav2Map, read_nav2
 from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.recorded_views import read_whisker_views
-from evaluation.artifacts.run_reader import read_column, read_run
+from evaluation.artifacts.run_reader import read_columns, read_run
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.metrics.trajectory import align
@@ -247,7 +247,8 @@ def read_exported_run(directory: Path, warn: Callable[[str], None]) -> _Exported
     """
     run = arrange_pieces(read_run(directory))
     steps, truth = len(run.time), None
-    columns = [read_column(directory / "steps.csv", name)[:steps] for name in ("sd_x", "sd_y", "sd_heading")]
+    found = read_columns(directory / "steps.csv", "sd_x", "sd_y", "sd_heading")
+    columns = [column[:steps] for column in found]
     closures = read_closure_table(directory)
     known = np.flatnonzero(((closures.steps >= 0) & (closures.steps < steps)).all(axis=1))
     bad = ~((run.time >= 0) & (run.time <= LAST_SECOND))

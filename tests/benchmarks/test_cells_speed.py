@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.cells.analysis import analyse_all_cells
+from evaluation.cells.analysis import analyse_cells
 from evaluation.cells.head_direction import mean_vector_length, preferred_direction
 from evaluation.cells.information import information
 from evaluation.cells.rate_map import rate_maps, tuning_curves
@@ -39,4 +39,4 @@ def test_maps_information_and_tuning_of_all_cells(benchmark, recording):
 
 
 def test_all_scores_of_all_cells(benchmark, recording):
-    assert len(benchmark(analyse_all_cells, recording).cell) == CELLS
+    assert len(benchmark(analyse_cells, recording).cell) == CELLS

@@ -209,7 +209,7 @@ def _run_lesion(task: tuple[str, str, int]) -> tuple[SessionFigures | None, set[
             true = int((claims.accepted & (claims.distance <= FALSE_DISTANCE)).sum())
             return None, {(step,) for step in np.flatnonzero(claims.accepted).tolist()}, true
         result, figures = run_and_measure(TouchTask(row, maze), new_session)
-    true = int((closure_errors(result) <= FALSE_CLOSURE_DISTANCE).sum())
+    true = int((closure_errors(result.truth, result.closures) <= FALSE_CLOSURE_DISTANCE).sum())
     return figures, set(map(tuple, result.closures.tolist())), true
 
 

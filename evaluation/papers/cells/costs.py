@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from evaluation.cells.analysis import analyse_all_cells
+from evaluation.cells.analysis import analyse_cells
 from evaluation.cells.head_direction import mean_vector_length, rayleigh_p
 from evaluation.cells.information import information, information_rate
 from evaluation.cells.rate_map import rate_maps, tuning_curves
@@ -26,7 +27,7 @@ CELLS, SHUFFLES, ROUNDS = 500, 100, 3
 """Cells with grid scores, shuffles of each, and repeats of the other rows."""
 ANALYSES = (
     ("rate maps, information, tuning", "5"),
-    ("all scores of `analyse_all_cells`", ""),
+    ("all scores of `analyse_cells`", ""),
     ("grid scores with shuffles", "60"),
 )
 """With the goals of their wall time, s."""
@@ -45,7 +46,8 @@ def measure_analysis(
     """
     recording = record_rat("rat", cells, sums=True, seconds=seconds, seed=seed)
     bins, score = path_bins(recording, "place"), PLACE_SCORES["grid score"]
-    calls = partial(_map_and_tune, recording), partial(analyse_all_cells, recording)
+    sums = recording._replace(cell=recording.cell[:0], activity=recording.activity[:, :0])
+    calls = partial(_map_and_tune, recording), partial(analyse_cells, sums)
     with _on_one_core() as found:
         repeats = [[time_call(call) for call in calls] for _ in range(ROUNDS)]
         times = np.median(repeats, axis=0).tolist()
@@ -109,11 +111,9 @@ def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> tuple[str, Tim
             own += [f"rat_simulation.seconds={steps / 50}", "rat_simulation.rate_hz=50", "seed=0"]
             own += ["rat_simulation.walk={}", "rat_simulation.views.every=5", "session.reserve=2048"]
             tasks = tasks_of(cell_study(Path("rat_box"), own))
-            score_task(tasks[0]._replace(parameters=tasks[0].parameters[:1], size=1))
+            score_task(_whole(tasks[0]._replace(parameters=tasks[0].parameters[:1])))
             reset_peak_memory()
-            each = [
-                time_call(partial(score_task, task._replace(size=len(task.parameters)))) for task in tasks
-            ]
+            each = [time_call(partial(score_task, _whole(task))) for task in tasks]
             times = [sum(column) / (sets * steps) for column in zip(*each, strict=True)]
             goal = [time * SETS * STEPS / 60 for time in times]
             rows.append((sets, *(1e6 * time for time in times), *goal, peak_memory() * 2**20 / 1e6))
@@ -123,6 +123,11 @@ def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> tuple[str, Tim
         f"at 10 Hz. Compiling is not included. Minutes are {how}. {found[0]}"
     )
     return note, rows
+
+
+def _whole(task: Any) -> Any:
+    """A chunk that is not filled up."""
+    return task._replace(plan=task.plan.model_copy(update={"chunk": len(task.parameters)}))
 
 
 def _table_networks(result: tuple[str, Times]) -> list[str]:

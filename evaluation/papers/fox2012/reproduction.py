@@ -39,7 +39,7 @@ from evaluation.papers.trial_sessions import (
     simulate_session,
 )
 from evaluation.plots import style
-from evaluation.plots.grid_plot import GridPanel, GridPaths, draw_grids
+from evaluation.plots.grid_plot import GridPanel, draw_grids
 from ratslam.runs.run_directory import true_grid
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import override, parse, validate
@@ -324,7 +324,7 @@ def _draw_reproduction(name: str, protocol: _Protocol, rows: Sequence[ResultRow]
 
 def _with_paths(name: str, row: ResultRow) -> GridPanel:
     line = f"{row.key[1]}, {row.values['online_error']:.3f} ({row.values['odometry_error']:.3f})"
-    paths = GridPaths(row.session.truth, row.session.online, row.session.odometry)
+    paths = (row.session.truth, row.session.online, row.session.odometry)
     return _panel(name, line, row)._replace(paths=paths)
 
 

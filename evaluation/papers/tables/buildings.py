@@ -11,6 +11,7 @@ over its closures are; in the table `laser` if its two steps are 2.5 pose cells 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import islice, product
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -24,7 +25,7 @@ from evaluation.papers.tables.markdown import markdown_header, markdown_row, sel
 from evaluation.papers.tables.recordings import GOLDEN, Recording, metres, real_recordings
 from evaluation.papers.trial_sessions import ClosureClaims, closure_claims, run_recording
 from evaluation.studies.executor import run_tasks
-from evaluation.studies.perturbation import lose_labels, miscalibrate, mistake_labels, perturb, rename_labels
+from evaluation.studies.perturbation import Perturbation, miscalibrate, perturb, spoil_labels
 from ratslam.runs.settings.run_config import RunConfig
 
 FALSE_DISTANCE, FALSE_TURN = 2.0, np.radians(30)
@@ -33,11 +34,11 @@ HARM_FACTOR, HARM_MARGIN = 1.05, 0.3
 """Of odometry's ATE, and m."""
 _SUFFIX = "_odom_gt.csv"
 """End of the file names of buildings, in the folder `buildings` of the real recordings."""
-_PERTURBATIONS = {
+_PERTURBATIONS: dict[str, Perturbation] = {
     "miscalibrated": miscalibrate,
-    "ids lost": lose_labels,
-    "ids wrong": mistake_labels,
-    "ids new": rename_labels,
+    "ids lost": partial(spoil_labels, kind="lost"),
+    "ids wrong": partial(spoil_labels, kind="wrong"),
+    "ids new": partial(spoil_labels, kind="new"),
 }
 COLUMNS = (
     "recording", "odometry", "final", "live", "final of copies: median, worst",

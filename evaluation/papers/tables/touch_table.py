@@ -254,7 +254,7 @@ def run_and_measure(
         log = replace(log, views=np.zeros_like(log.views))
     result = run_session(config, log, start)
     truth = result.truth
-    true_closures = result.closures[closure_errors(result) <= FALSE_CLOSURE_DISTANCE]
+    true_closures = result.closures[closure_errors(result.truth, result.closures) <= FALSE_CLOSURE_DISTANCE]
     returned = experience_metric_if_defined(result) is not None  # else a quarter is the base set
     metrics = touch_metrics(result, ExmConfig(base=None if returned else len(truth) // 4))
     snapped = result.trajectory.copy()

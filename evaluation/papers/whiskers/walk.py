@@ -154,7 +154,7 @@ def _table(walks: list[_WalkResult]) -> list[str]:
 def _line(walk: _WalkResult) -> str:
     """The row of a walk."""
     real, three = walk.real, walk.turned
-    false = closure_errors(real) > FALSE_CLOSURE_DISTANCE if len(real.closures) else np.zeros(0, bool)
+    false = closure_errors(real.truth, real.closures) > FALSE_CLOSURE_DISTANCE
     late = real.closures[:, 0] >= three if len(real.closures) else false
     cells = [str(walk.maze), str(len(real.truth))]
     cells += [f"{_energy(real):.3f}", f"{_energy(real, odometry=True):.3f}"]

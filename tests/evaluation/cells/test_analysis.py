@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from evaluation.cells.analysis import AnalysisSettings, analyse_all_cells, analyse_cells, write_scores
+from evaluation.cells.analysis import analyse_cells, write_scores
 from evaluation.cells.information import information
 from evaluation.cells.rate_map import arena_edges, bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
@@ -43,15 +43,15 @@ def test_gain_turns_activity_into_spikes() -> None:
     activity = np.full((len(WALK.time), 1), 1 / np.prod(SHAPE))
     recording = _recording()._replace(cell=np.array([7]), activity=activity)
     for gain, rate in ((None, 1.0), (2.5 * np.prod(SHAPE), 2.5)):
-        scores = analyse_cells(recording, AnalysisSettings(gain=gain))
+        scores = analyse_cells(recording, gain)
         assert_allclose([scores.mean_rate[0], scores.peak_rate[0], scores.heading_peak[0]], rate)
 
 
 def test_all_cells_from_sums_are_scored_as_from_time_series() -> None:
     recording = _recording()._replace(shape=(5, 1, 2))
-    edges = arena_edges(WALK.truth, 20)
-    sums = bin_activity(WALK.time, WALK.truth, recording.activity, *edges, 36)
-    chosen, whole = analyse_cells(recording), analyse_all_cells(recording._replace(sums=sums))
+    sums = bin_activity(WALK.time, WALK.truth, recording.activity, *arena_edges(WALK.truth))
+    none = {"cell": recording.cell[:0], "activity": recording.activity[:, :0]}
+    chosen, whole = analyse_cells(recording), analyse_cells(recording._replace(sums=sums, **none))
     for name, a, b in zip(chosen._fields, chosen, whole, strict=True):
         assert_allclose(a, b, atol=1e-12, err_msg=name)
     assert (whole.conjunctive == np.minimum(whole.information, whole.heading_information)).all()
@@ -70,9 +70,7 @@ def test_table_is_written_exactly(tmp_path: Path) -> None:
 
 def test_bad_recordings_give_one_clear_error() -> None:
     recording = _recording()
-    with pytest.raises(InputError, match=r"recording\.sums"):
-        analyse_all_cells(recording)
-    with pytest.raises(InputError, match="choose cells"):
+    with pytest.raises(InputError, match="no cells"):
         analyse_cells(recording._replace(cell=np.zeros(0, int), activity=np.zeros((len(WALK.time), 0))))
     with pytest.raises(InputError, match="one column"):
         analyse_cells(recording._replace(activity=recording.activity[:, :5]))

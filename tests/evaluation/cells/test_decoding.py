@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.special import gammaln, xlogy
 
-from evaluation.cells.decoding import DecodingSettings, decode_positions, log_posterior
+from evaluation.cells.decoding import decode_positions, log_posterior
 from evaluation.cells.recording import CellRecording
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -58,7 +58,7 @@ def test_unknown_poses_are_left_out() -> None:
 
 
 def test_seed_sets_the_control_alone() -> None:
-    a, b, c = (decode_positions(_recording(), DecodingSettings(shifts=5), seed) for seed in (0, 0, 1))
+    a, b, c = (decode_positions(_recording(), shifts=5, seed=seed) for seed in (0, 0, 1))
     assert (a.control == b.control).all()
     assert (a.control != c.control).any()
     assert a.median == c.median
@@ -81,6 +81,6 @@ def test_posterior_is_that_of_poisson_cells() -> None:
 
 def test_short_recordings_are_refused() -> None:
     with pytest.raises(InputError, match="four blocks"):
-        decode_positions(_recording(), DecodingSettings(block=200.0))
+        decode_positions(_recording(), block=200.0)
     with pytest.raises(InputError, match="no known pose"):
         decode_positions(_recording()._replace(truth=np.full_like(WALK.truth, np.nan)))

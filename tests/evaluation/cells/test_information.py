@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose
 
 from evaluation.cells.information import (
     conjunctive_information,
-    exceeds_both,
     information,
     information_above_mean,
     information_rate,
@@ -131,8 +130,3 @@ def test_product_cells_are_conjunctive_and_others_are_not() -> None:
     assert both > 0.5
     assert place_only < 0.1
     assert turn_only < 0.15
-
-
-def test_sargolini_cells_exceed_both_thresholds() -> None:
-    grid, vector = np.array([0.5, 0.5, 0.1, np.nan]), np.array([0.4, 0.1, 0.4, 0.4])
-    assert exceeds_both(grid, vector, 0.3, 0.2).tolist() == [True, False, False, False]

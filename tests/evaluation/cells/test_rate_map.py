@@ -50,7 +50,7 @@ def test_a_cell_that_is_always_active_has_a_flat_map(smoothing: float) -> None:
     sums = mixed_sums(WALK)
     rates = rate_maps(sums, smoothing)[9]
     assert_allclose(rates[np.isfinite(rates)], 1.0, rtol=1e-12)
-    curve = tuning_curves(sums, smoothing)[9]
+    curve = tuning_curves(sums)[9]
     assert_allclose(curve[np.isfinite(curve)], 1.0, rtol=1e-12)
 
 

@@ -104,8 +104,8 @@ def test_action_and_step_logs_differ(square):
     ids[40:44] = 99  # a place made anew in the second lap, after which half of the third is new as well
     ids[80:96] = np.arange(100, 104).repeat(4)
     step, action = (experience_metric(ids, truth, ExmConfig(log=log)) for log in ("step", "action"))
-    assert (step.log, step.entries, step.base) == ("step", 64, 32)
-    assert (action.log, action.entries, action.base) == ("action", 16, 8)
+    assert (step.entries, step.base) == (64, 32)
+    assert (action.entries, action.base) == (16, 8)
     assert action.arr == experience_metric(ids[::4], truth[::4]).arr
 
 

@@ -19,8 +19,6 @@ from evaluation.metrics.occupancy_score import (
     CLAMP,
     CONVENTIONS,
     MAIN_CONVENTION,
-    grid_error,
-    pool_errors,
     score_grid,
     smooth_truth,
 )
@@ -328,6 +326,3 @@ def test_invalid_maps_are_refused():
     for other in (empty._replace(cell=0.1), empty._replace(origin=empty.origin + 1)):
         with pytest.raises(ValueError, match="expected the same shape"):
             mean_grid([empty, other])
-    surface = touchable_surface(empty, truth)
-    with pytest.raises(ValueError, match="different"):
-        pool_errors([grid_error(empty, truth, surface, each) for each in (MAIN_CONVENTION, ARENA)])

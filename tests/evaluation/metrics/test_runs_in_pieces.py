@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from evaluation.artifacts.run_reader import read_pieces, read_run, write_pieces
+from evaluation.artifacts.run_reader import read_run, write_pieces
 from evaluation.metrics.run_metrics import PIECES, arrange_pieces, ate_within_pieces
 from evaluation.metrics.scorecard import score_run
 from evaluation.metrics.trajectory import ate, write_tum
@@ -123,6 +123,7 @@ def test_the_saved_map_of_a_localised_session_stays_where_it_is(circle, tmp_path
     run = read_run(tmp_path)
     shown = arrange_pieces(run)
     assert np.array_equal(run.found, found)
+    assert np.array_equal(run.piece, piece)
     assert shown.nodes == pytest.approx(circle.nodes)
     assert shown.final[found] == pytest.approx(circle.final[found], abs=1e-9)
     if seen and found.any():
@@ -152,10 +153,11 @@ def test_without_truth_a_picture_shows_pieces_side_by_side(parted):
     assert f"piece 1, {steps} steps" in names
 
 
-def test_the_pieces_of_steps_read_back_equal(tmp_path):
-    piece = np.array([0, 0, 1, 2, 0])
-    write_pieces(tmp_path / "pieces.csv", np.arange(5) / 3, piece)
-    assert read_pieces(tmp_path / "pieces.csv", 5).tolist() == piece.tolist()
-    assert read_pieces(tmp_path / "none.csv", 2).tolist() == [0, 0]
+def test_a_run_with_too_few_pieces_is_refused(circle, tmp_path):
+    for name in ("online", "odometry", "truth"):
+        write_tum(tmp_path / f"{name}.tum", circle.time, circle.online)
+    (tmp_path / "steps.csv").write_text("place\n" + "-1\n" * len(circle.time))
+    assert (read_run(tmp_path).piece == 0).all()
+    write_pieces(tmp_path / "pieces.csv", circle.time[:5], np.zeros(5, int))
     with pytest.raises(InputError, match="5 lines"):
-        read_pieces(tmp_path / "pieces.csv", 6)
+        read_run(tmp_path)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.cells.rate_map import arena_edges, bin_activity
+from evaluation.cells.rate_map import arena_edges, bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
-from evaluation.plots.cell_plot import draw_cells, draw_recorded_cells, draw_spikes_on_path, map_cells
+from evaluation.plots.cell_plot import choose_cells, draw_cells, draw_recorded_cells, draw_spikes_on_path
 from tactile.base.errors import InputError
 
 STEPS = 3000
@@ -34,16 +34,17 @@ def subtitle(figure):
 
 
 def test_twelve_of_the_more_active_cells_are_mapped():
-    maps = map_cells(recorded())
-    assert len(maps.cell) == 12
-    assert (maps.cell % 2 == 0).all()
-    assert (np.diff(maps.cell) > 0).all()
-    row, column = np.unravel_index(np.nanargmax(maps.rates.reshape(12, -1), axis=1), maps.rates.shape[1:])
+    sums, cell = choose_cells(recorded())
+    rates = rate_maps(sums)
+    assert len(cell) == 12
+    assert (cell % 2 == 0).all()
+    assert (np.diff(cell) > 0).all()
+    row, column = np.unravel_index(np.nanargmax(rates.reshape(12, -1), axis=1), rates.shape[1:])
     np.testing.assert_allclose(row, column, atol=4)  # the diagonal
 
 
 def test_each_cell_is_drawn_as_a_map_and_a_dial():
-    figure = draw_cells("cells", map_cells(recorded(5), most=3))
+    figure = draw_cells("cells", *choose_cells(recorded(5), most=3))
     assert [bool(axes.images) for axes in figure.axes] == [True, False] * 3
     assert figure.axes[0].get_title().startswith("cell 0\n")
 
@@ -57,9 +58,9 @@ def test_a_silent_cell_is_said_to_be_silent():
 def test_sums_of_all_cells_are_drawn_without_chosen_ones():
     one = recorded(20)
     sums = bin_activity(one.time, one.truth, one.activity, *arena_edges(one.truth, 10))
-    maps = map_cells(one._replace(cell=one.cell[:0], activity=one.activity[:, :0], sums=sums), most=4)
-    assert maps.rates.shape == (4, 10, 10)
-    assert (maps.cell % 2 == 0).all()
+    few, cell = choose_cells(one._replace(cell=one.cell[:0], activity=one.activity[:, :0], sums=sums), most=4)
+    assert few.place.shape == (4, 10, 10)
+    assert (cell % 2 == 0).all()
 
 
 @pytest.mark.parametrize("case", ["no truth", "a line", "no cells", "one step"])
@@ -74,7 +75,7 @@ def test_a_recording_without_maps_gives_a_plot_with_the_reason(case):
                "no cells": none, "one step": rows}  # fmt: skip
     broken = one._replace(**changes[case])
     with pytest.raises(InputError):
-        map_cells(broken)
+        draw_cells("cells", *choose_cells(broken))
     assert subtitle(draw_recorded_cells("cells", broken)).startswith("no rate maps: ")
 
 

@@ -14,7 +14,6 @@ from evaluation.metrics.occupancy_grid import PRIOR_OCCUPANCY, GridTruth, Occupa
 from evaluation.metrics.occupancy_score import score_grid
 from evaluation.plots.grid_plot import (
     GridPanel,
-    GridPaths,
     draw_grid,
     draw_grids,
     grid_headline,
@@ -26,7 +25,7 @@ SIDE = np.array(
 )
 TURN = np.linspace(0, 9, 80)
 WAY = 0.4 * np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
-PATHS = GridPaths(WAY, WAY + [0.03, 0.04], WAY * 3)
+PATHS = (WAY, WAY + [0.03, 0.04], WAY * 3)
 
 
 def grid(height=50, width=50, seed=0):
@@ -133,9 +132,8 @@ def test_walls_and_paths_are_drawn_at_their_position():
         "online path, mean error 0.050 m",
         "start",
     ]
-    for line, path in zip(
-        lines.values(), (PATHS.odometry, PATHS.truth, PATHS.estimate, WAY[:1]), strict=True
-    ):
+    true, online, odometry = PATHS
+    for line, path in zip(lines.values(), (odometry, true, online, WAY[:1]), strict=True):
         assert np.allclose(line.get_xydata(), path)
     assert axes.get_xlim() == pytest.approx((-1.25, 1.25))  # dead reckoning may leave, the map stays
     assert lines["truth"].get_color() == YELLOW
@@ -145,9 +143,9 @@ def test_walls_and_paths_are_drawn_at_their_position():
 def test_rows_without_truth_are_not_drawn():
     truth = WAY.copy()
     truth[::2] = np.nan
-    (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=truth))))
+    (axes,) = maps(draw_grid(panel(paths=(truth, *PATHS[1:]))))
     assert [line.get_label() for line in axes.lines][2] == "online path, mean error 0.050 m"
-    (axes,) = maps(draw_grid(panel(paths=PATHS._replace(truth=np.full_like(WAY, np.nan)))))
+    (axes,) = maps(draw_grid(panel(paths=(np.full_like(WAY, np.nan), *PATHS[1:]))))
     assert [line.get_label() for line in axes.lines] == ["odometry", "truth", "online path"]
 
 

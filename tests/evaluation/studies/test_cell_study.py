@@ -17,15 +17,12 @@ import pytest
 from evaluation.studies.cell_study import (
     FOLDER,
     PARAMETERS,
-    CellPlan,
     cell_study,
-    parameter_sets,
     run_cell_study,
-    score_sets,
 )
 from evaluation.studies.executor import Executor
 from evaluation.studies.network_batch import CellSets, walk
-from evaluation.studies.study_course import expected_poses, place_bins, read_course
+from evaluation.studies.study_course import expected_poses, read_course
 from ratslam.cli import main
 from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.settings.run_config import load_config
@@ -76,18 +73,20 @@ def sets_of(arguments: list[str]) -> list[str]:
     return [part for each in arguments for part in ("--set", each)]
 
 
-def test_without_noise_the_packet_follows_the_truth(box):
-    study = cell_study(box(), ["steps=200", "sets=1", "precision=float64"])
-    one = [np.array([value]) for value in (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0)]
-    scores = score_sets(study.course, CellSets(*one), np.dtype(float))
-    assert scores.drift[0] < 0.02  # a fifth of a cell
-    assert scores.drift_heading[0] < 0.05
-    assert scores.decoding[0] <= scores.drift[0]
-    assert not scores.reseeded.any()
+def test_without_noise_the_packet_follows_the_truth(box, tmp_path):
+    values = dict(zip(PARAMETERS, (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0), strict=True))
+    fixed = [f"{name}=[{value}, {value}]" for name, value in values.items()]
+    study = cell_study(box(), ["steps=200", "sets=1", "precision=float64", *fixed])
+    with Executor(1) as executor:
+        scores = run_cell_study(study, tmp_path / "out", executor)
+    assert scores["drift"][0] < 0.02  # a fifth of a cell
+    assert scores["drift_heading"][0] < 0.05
+    assert scores["decoding"][0] <= scores["drift"][0]
+    assert not scores["reseeded"].any()
     course = study.course
     visited = np.bincount(course.bin, minlength=400).reshape(20, 20) > 0
-    assert (np.isfinite(scores.maps[0]) == visited).all()
-    assert (np.nanmax(scores.maps[0], axis=(1, 2)) > 1e-3).all()  # each cell lies on the way
+    assert (np.isfinite(scores["maps"][0]) == visited).all()
+    assert (np.nanmax(scores["maps"][0], axis=(1, 2)) > 1e-3).all()  # each cell lies on the way
 
 
 def test_expected_poses_start_in_the_middle_of_the_torus_and_keep_lengths(box):
@@ -100,20 +99,20 @@ def test_expected_poses_start_in_the_middle_of_the_torus_and_keep_lengths(box):
     assert np.allclose(again, course.expected)
 
 
-def test_every_position_lies_in_its_bin():
-    truth = np.random.default_rng(0).normal(size=(50, 3))
-    bin, x_edges, y_edges = place_bins(truth, 7)
-    row, column = np.divmod(bin, 7)
-    for edges, at, values in ((x_edges, column, truth[:, 0]), (y_edges, row, truth[:, 1])):
+def test_every_position_lies_in_its_bin(box):
+    course = read_course(load_config(box()), 200, False, 7, (), 0)
+    truth = np.load(box().parent / "walk.npz")["truth"]
+    row, column = np.divmod(course.bin, 7)
+    for edges, at, values in ((course.x_edges, column, truth[:, 0]), (course.y_edges, row, truth[:, 1])):
         assert (values >= edges[at] - 1e-12).all()
         assert (values <= edges[at + 1] + 1e-12).all()
 
 
-def test_a_larger_study_contains_a_smaller_one():
-    few, many = (parameter_sets(CellPlan(sets=sets)) for sets in (5, 9))
-    assert np.array_equal(many[:5], few)
-    for name, column in zip(PARAMETERS, many.T, strict=True):
-        low, high = getattr(CellPlan(), name)
+def test_a_larger_study_contains_a_smaller_one(box):
+    few, many = (cell_study(box(), [*SMALL, f"sets={sets}"]) for sets in (5, 9))
+    assert np.array_equal(many.parameters[:5], few.parameters)
+    for name, column in zip(PARAMETERS, many.parameters.T, strict=True):
+        low, high = getattr(many.plan, name)
         assert (column >= low).all()
         assert (column <= high).all()
 
@@ -163,8 +162,8 @@ def test_bytes_do_not_depend_on_interrupts(box, tmp_path):
         again = run_cell_study(study, tmp_path / "one", executor, counted.append)
     assert chunks(tmp_path / "one") == alone
     assert counted == [2, 2]
-    for a, b in zip(scores, again, strict=True):
-        assert np.array_equal(a, b, equal_nan=True)
+    for name, column in scores.items():
+        assert np.array_equal(column, again[name], equal_nan=True)
 
 
 def test_a_larger_study_computes_only_what_is_new(box, tmp_path):
@@ -174,7 +173,7 @@ def test_a_larger_study_computes_only_what_is_new(box, tmp_path):
         scores = run_cell_study(cell_study(box(), [*SMALL, "sets=5"]), tmp_path, executor)
     assert before.items() < chunks(tmp_path).items()
     assert len(chunks(tmp_path)) == 3
-    assert scores.maps.shape == (5, 8, 5, 5)
+    assert scores["maps"].shape == (5, 8, 5, 5)
 
 
 def test_the_program_writes_table_maps_and_pictures(box, tmp_path, capsys):

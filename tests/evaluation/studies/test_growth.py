@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.studies.growth import FILE, GrowthPlan, GrowthTask, growth_study, measure_growth, read_rows
+from evaluation.studies.growth import FILE, growth_study, measure_growth, read_rows
 from ratslam.cli import main
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.world.maze import CELL_SIDE
@@ -40,12 +40,12 @@ def errors(row):
 
 
 def test_lengths_double_up_to_the_greatest():
-    plan = GrowthPlan(first=400, known_ground=100_000, new_ground=0)
-    lengths = plan.lengths("known ground")
+    square = ROOT / "configs" / "square.yaml"
+    _, ((_, _, lengths, _),) = growth_study(square, ["first=400", "known_ground=100000"])
     assert lengths[:3] == [400, 800, 1600]
     assert lengths[-2:] == [51_200, 100_000]
-    assert plan.lengths("new ground") == []
-    assert GrowthPlan(first=400, known_ground=100).lengths("known ground") == [100]
+    _, ((_, _, lengths, _),) = growth_study(square, ["first=400", "known_ground=100"])
+    assert lengths == [100]
 
 
 def test_known_ground_repeats_its_laps_and_new_ground_enters_no_cell_twice(config):
@@ -101,12 +101,11 @@ def test_the_program_writes_rows_table_and_picture(config, tmp_path, capsys):
 
 def test_a_measurement_on_the_way_changes_nothing(config):
     _, tasks = growth_study(config, ["first=32", "known_ground=96", "new_ground=0"])
-    ground, settings, lengths, _ = tasks[0]
     steps = []
-    rows = list(measure_growth(GrowthTask(ground, settings, lengths), lambda: steps.append(1)))
-    assert [row.steps for row in rows] == lengths == [32, 64, 96]
+    rows = list(measure_growth(tasks[0], lambda: steps.append(1)))
+    assert [row.steps for row in rows] == [32, 64, 96]
     assert len(steps) == 96
-    (alone,) = measure_growth(GrowthTask(ground, settings, [96]))
+    (alone,) = measure_growth(tasks[0]._replace(lengths=[96]))
     assert errors(alone) == errors(rows[-1])
 
 

@@ -16,14 +16,11 @@ from evaluation.metrics.statistics import pareto_optimal
 from evaluation.studies.metrics import COLUMNS, METRICS, find_error
 from evaluation.studies.study import StudyPlan
 from evaluation.studies.study_report import (
-    default_error,
     label,
     make_report,
-    mark_optimal,
     render,
     save_report,
     spread,
-    summarise,
 )
 from tactile.base.errors import InputError
 from tests.evaluation.studies.conftest import record
@@ -103,7 +100,7 @@ def test_the_default_error_is_the_first_that_all_rows_have():
 
     def default(*groups):
         named = [each.model_copy(update={"row": f"{k}"}) for k, group in enumerate(groups) for each in group]
-        return default_error(summarise(named))
+        return make_report("name", plan("pareto", pace="live"), named).error
 
     assert default([rat], [rat]) == "energy_all"
     assert default([rat], [grid]) == "ate_final"
@@ -128,14 +125,13 @@ PARETO = [
 
 
 def test_a_row_is_judged_by_medians_and_only_if_none_of_its_runs_failed():
-    objectives = {"step_time": "low", "energy_all": "low"}
-    found = {row.row: row for row in mark_optimal(summarise(PARETO), objectives, "median")}
+    found = {row.row: row for row in make_report("name", plan("pareto", pace="live"), PARETO).rows}
     assert {name for name, row in found.items() if row.optimal} == {"slow", "fast", "same"}
-    time, error = (found["slow"].spreads[name] for name in objectives)
+    time, error = (found["slow"].spreads[name] for name in ("step_time", "energy_all"))
     assert (time.median, time.low, time.high, time.worst) == (10, 9, 40, 40)
     assert (error.median, error.low, error.high, error.worst) == (2, 1, 3, 3)
     assert (found["lost"].runs, found["lost"].failed) == (2, 1)
-    assert not any(row.optimal for row in summarise(PARETO))
+    assert not any(row.optimal for row in make_report("name", plan("means"), PARETO).rows)
 
 
 def test_a_pareto_report_marks_the_front_in_every_form(tmp_path):
@@ -222,4 +218,4 @@ def test_labels_are_as_short_as_possible():
 
 
 def test_two_values_with_equal_labels_are_two_rows():
-    assert len(summarise([record(varied={"k": 1}), record(varied={"k": "1"})])) == 2
+    assert len(make_report("name", plan("means"), [record(varied={"k": k}) for k in (1, "1")]).rows) == 2

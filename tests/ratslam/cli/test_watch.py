@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from evaluation.artifacts.manifest import RUNNING, SESSION_REPORT
 from evaluation.artifacts.run_reader import read_run, read_walls
-from evaluation.monitor import RunMonitor, RunProgress, draw_watch, path_length, watch_run
+from evaluation.monitor import RunMonitor, RunProgress, draw_watch, watch_run
 from ratslam.cli import main
 from ratslam.cli.live import monitor
 from ratslam.core.session import CHUNK
@@ -118,7 +118,7 @@ def test_a_finished_run_is_seen_as_it_is_read(alone, tmp_path, capsys):
     assert np.array_equal(seen.truth, run.truth[:, :2], equal_nan=True)
     assert seen.online_error == run.online_error[-1]
     assert sum(seen.outcomes.values()) == len(run.time) == seen.checkpoint
-    assert f"{path_length(seen.odometry):.1f} m" in line
+    assert f"{seen.length:.1f} m" in line
     assert np.isfinite(seen.sd).all()
 
 

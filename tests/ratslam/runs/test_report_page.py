@@ -15,7 +15,7 @@ import pytest
 from evaluation.artifacts.closure_table import read_closure_table
 from evaluation.artifacts.recorded_views import read_closure_views
 from evaluation.report.charts import PALETTE
-from evaluation.report.run_report import display_gain
+from evaluation.report.run_report import view_records
 from ratslam.cli import main
 from ratslam.runs.map_results import write_report
 from tests.helpers.square_run import copy_square_run
@@ -211,7 +211,8 @@ def check_shown(shown: dict[str, Any], number: int, directory: Path) -> None:
     assert shown["chosen"] == f"Steps {earlier} and {later}: {words}."
     assert shown["pressed"] == [number]
     rows = np.searchsorted(views.step, [earlier, later])
-    bright = np.minimum(np.ceil(views.view[rows] * display_gain(views.view)), 255)
+    gain = (view_records(views) or {})["gain"]
+    bright = np.minimum(np.ceil(views.view[rows] * gain), 255)
     assert shown["views"] == bright.reshape(2, -1).tolist()
     assert [label.split(",")[0] for label in shown["labels"]] == [
         f"View at step {k}" for k in (earlier, later)

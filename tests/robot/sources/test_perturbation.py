@@ -66,9 +66,11 @@ def test_a_course_without_truth_cannot_be_repeated(log):
         repeat_course(replace(log, truth=None), 100, 0)
 
 
-def test_some_labels_are_replaced_by_new_or_wrong_ones():
-    label = np.where(np.arange(3000) % 3 == 0, np.arange(3000) // 300, -1).astype(np.int32)
-    changed = perturbation.corrupt_labels(label, np.random.default_rng(0))
+def test_some_labels_are_replaced_by_new_or_wrong_ones(log):
+    rows = np.arange(log.length)
+    label = np.where(rows % 3 == 0, rows * 10 // log.length, -1).astype(np.int32)
+    labelled = replace(log, label=label)
+    label, changed = np.resize(label, 9 * log.length), repeat_course(labelled, 9 * log.length, 0).label
     given = label >= 0
     assert np.array_equal(changed < 0, ~given)
     new = changed[given] > label.max()
@@ -138,26 +140,26 @@ def labelled(log):
 
 def test_a_third_of_the_labels_is_lost_or_wrong(labelled):
     given = labelled.label >= 0
-    lost = perturbation.lose_labels(labelled, 1).label
+    lost = perturbation.spoil_labels(labelled, 1, "lost").label
     assert (lost[given] < 0).mean() == pytest.approx(1 / 3, abs=0.01)
     assert np.array_equal(lost[lost >= 0], labelled.label[lost >= 0])
-    wrong = perturbation.mistake_labels(labelled, 1).label
+    wrong = perturbation.spoil_labels(labelled, 1, "wrong").label
     assert (wrong != labelled.label)[given].mean() == pytest.approx(1 / 3, abs=0.01)
     assert set(wrong) <= set(labelled.label)
     assert np.array_equal(wrong < 0, ~given)
 
 
 def test_new_labels_are_used_once_and_only_at_known_places(labelled):
-    new = perturbation.rename_labels(labelled, 1).label
+    new = perturbation.spoil_labels(labelled, 1, "new").label
     changed = np.flatnonzero(new != labelled.label)
     assert len(np.unique(new[changed])) == len(changed)
     assert new[changed].min() > labelled.label.max()
     assert all(labelled.label[row] in labelled.label[:row] for row in changed)
     known = (labelled.label >= 0).sum() - 50
     assert len(changed) == pytest.approx(known / 3, abs=1)
-    assert not np.array_equal(new, perturbation.rename_labels(labelled, 2).label)
+    assert not np.array_equal(new, perturbation.spoil_labels(labelled, 2, "new").label)
 
 
-@pytest.mark.parametrize("spoil", [perturbation.lose_labels, perturbation.mistake_labels])
-def test_recordings_without_labels_are_not_spoilt(log, spoil):
-    assert np.array_equal(spoil(log, 1).label, log.label)
+@pytest.mark.parametrize("kind", ["lost", "wrong"])
+def test_recordings_without_labels_are_not_spoilt(log, kind):
+    assert np.array_equal(perturbation.spoil_labels(log, 1, kind).label, log.label)

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from evaluation.cells.analysis import AnalysisSettings, analyse_cells
+from evaluation.cells.analysis import analyse_cells
 from evaluation.cells.recording import write_recording
 from ratslam.classic.config import NetworkConfig
 from ratslam.cli import main
@@ -159,6 +159,6 @@ def test_scores_are_a_line_for_each_cell_in_hz(run, recording, tmp_path):
     table = np.genfromtxt(tmp_path / "cells.csv", delimiter=",", names=True)
     network = NetworkConfig(cells_xy=7, cells_heading=8)
     gain = 30 / settled_peak(network)
-    scores = analyse_cells(recording, AnalysisSettings(gain=gain))
+    scores = analyse_cells(recording, gain)
     np.testing.assert_array_equal(table["cell"], CELLS)
     np.testing.assert_array_equal(table["mean_rate"], scores.mean_rate)
