@@ -27,15 +27,13 @@ from ratslam.core.session import CHUNK, Session, Step, capacity_at
 from ratslam.methods.method_registry import BACKENDS, BackendEntry, Sensors
 from ratslam.service.check_results import (
     Result,
+    Trial,
     Violation,
     check,
-    checks_of,
+    find_parts,
     leaves,
-    read_assignments,
     require,
     require_equal,
-    require_settings_class,
-    run_checks,
 )
 from tactile.base.errors import InputError
 from tactile.base.types import Observation, Odometry, observation
@@ -63,15 +61,8 @@ FEELERS = PlanarWhiskers(np.zeros((WHISKERS, 2)), _around, np.full(WHISKERS, REA
 SENSORS = {"with whiskers": Sensors(VIEW, FEELERS), "without whiskers": Sensors(VIEW)}
 
 
-class BackendTrial:
-    """A method with settings: what its checks share, and the checks.
-
-    Args:
-        settings: an instance of the entry's `config_class`.
-    """
-
-    def __init__(self, entry: BackendEntry, settings: Any) -> None:
-        self.entry, self.settings = entry, settings
+class BackendTrial(Trial[BackendEntry]):
+    """A method with settings: what its checks share, and the checks."""
 
     def build(self, dtype: Any = np.float64) -> Backend:
         """A new backend for the first sensors that suit it."""
@@ -156,7 +147,7 @@ class BackendTrial:
     @check(ENTRY, "the entry is complete", "a run needs settings, columns and outcomes by name")
     def entry_is_complete(self) -> str:
         entry = self.entry
-        require_settings_class(entry.config_class)
+        super().entry_is_complete.run(self)
         fields = getattr(entry.evidence, "_fields", ())
         require("outcome" in fields, f"evidence {entry.evidence!r}", "a NamedTuple with a field `outcome`")
         outcomes = isinstance(entry.outcomes, type) and issubclass(entry.outcomes, IntEnum)
@@ -532,15 +523,10 @@ def check_backend(name: str, assignments: Sequence[str] = ()) -> Iterator[Result
     Raises:
         InputError: there is no such method, its package is broken, or the settings do not fit it.
     """
-    entry = BACKENDS.get(name, "check backend")
-    settings = read_assignments({"settings": entry.config_class}, assignments)["settings"]
+    entry, settings = find_parts({"settings": (BACKENDS, name, "check backend")}, assignments)["settings"]
     prepare_precision("float64")
-    return run_checks(CHECKS, BackendTrial(entry, settings))
+    return BackendTrial(entry, settings).run_checks()
 
 
 def _kind(leaf: Any) -> str:
     return f"{'weak ' if leaf.weak_type else ''}{leaf.dtype} {leaf.shape}"
-
-
-CHECKS = checks_of(BackendTrial)
-"""All checks of a method."""

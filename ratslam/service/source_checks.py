@@ -16,15 +16,13 @@ import numpy as np
 
 from ratslam.service.check_results import (
     Result,
+    Trial,
     Violation,
     check,
-    checks_of,
+    find_parts,
     leaves,
-    read_assignments,
     require,
     require_equal,
-    require_settings_class,
-    run_checks,
 )
 from robot.sources.source import SOURCES, ClosedSource, Sample, Source, SourceEntry, SourceInfo, rate_of
 from robot.touch_source import TOUCH, head_config_of, open_touch_source, report_config_of
@@ -72,18 +70,18 @@ class Reading(NamedTuple):
         return cls(samples, copies, again, complete, suppresses)
 
 
-class SourceTrial:
+class SourceTrial(Trial[SourceEntry]):
     """A source with settings: what its checks share, and the checks.
 
     Args:
-        settings: an instance of the entry's `config_class`. frontend: for readings that are not observations.
-        most: samples to examine.
+        frontend: for readings that are not observations. most: samples to examine.
     """
 
     def __init__(
         self, entry: SourceEntry, settings: Any, frontend: PluginConfig | None = None, most: int = SAMPLES
     ) -> None:
-        self.entry, self.settings, self.frontend, self.most = entry, settings, frontend, most
+        super().__init__(entry, settings)
+        self.frontend, self.most = frontend, most
 
     @cached_property
     def source(self) -> Source:
@@ -122,7 +120,7 @@ class SourceTrial:
     @check(OPENED, "the entry is complete", "a configuration names it with its settings")
     def entry_is_complete(self) -> str:
         entry = self.entry
-        require_settings_class(entry.config_class)
+        super().entry_is_complete.run(self)
         for suffix in entry.suffixes:
             sound = suffix.startswith(".") and suffix == suffix.lower()
             require(sound, f"suffix {suffix!r}", "a lower-case suffix such as '.bag'")
@@ -321,29 +319,21 @@ def check_source(
         InputError: there is no such source or front end, its package is broken, the settings do not fit, or
             the source refuses them, for example because a file is missing.
     """
-    entry = SOURCES.get(name, "check source")
-    models: dict[str, Any] = {"settings": entry.config_class}
+    named = {"settings": (SOURCES, name, "check source"), "touch": (TOUCH, touch, "--touch")}
+    parts, frontend = find_parts(named, assignments), None
     if touch is not None:
-        models["touch"] = TOUCH.get(touch, "--touch").config_class
-    settings = read_assignments(models, assignments)
-    frontend = None
-    if touch is not None:
-        given = settings["touch"]
+        given = parts["touch"][1]
         plain = {} if given is None else json.loads(given.model_dump_json(exclude_unset=True))
         frontend = PluginConfig(plugin=touch, settings=plain)
-    trial = SourceTrial(entry, settings["settings"], frontend, most)
+    trial = SourceTrial(*parts["settings"], frontend, most)
     try:
         _ = trial.source
     except InputError:
         raise
     except Exception:  # reported by a check
         pass
-    return run_checks(CHECKS, trial)
+    return trial.run_checks()
 
 
 def _is_count(value: Any, least: int = 0) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= least
-
-
-CHECKS = checks_of(SourceTrial)
-"""All checks of a source."""

@@ -8,17 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.service.check_results import (
-    Result,
-    Violation,
-    check,
-    checks_of,
-    read_assignments,
-    require,
-    require_equal,
-    require_settings_class,
-    run_checks,
-)
+from ratslam.service.check_results import Result, Trial, Violation, check, find_parts, require, require_equal
 from ratslam.service.source_checks import Reading, require_masked, require_shapes
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.source import SOURCES, Source
@@ -46,27 +36,24 @@ def check_touch(name: str, assignments: Sequence[str] = (), source: str | None =
     Raises:
         InputError: there is no such front end or source, its package is broken, or the settings do not fit.
     """
-    entry = TOUCH.get(name, "check touch")
-    models: dict[str, Any] = {"settings": entry.config_class}
-    if source is not None:
-        models["source"] = SOURCES.get(source, "--source").config_class
-    settings = read_assignments(models, assignments)
+    named = {"settings": (TOUCH, name, "check touch"), "source": (SOURCES, source, "--source")}
+    parts = find_parts(named, assignments)
     readings = None
     if source is not None:
-        readings = SOURCES.get(source, "--source").open(settings["source"] or NoSettings(), None)
-    return run_checks(CHECKS, TouchTrial(entry, settings["settings"], readings))
+        entry, settings = parts["source"]
+        readings = entry.open(settings or NoSettings(), None)
+    return TouchTrial(*parts["settings"], readings).run_checks()
 
 
-class TouchTrial:
+class TouchTrial(Trial[TouchEntry]):
     """A touch front end with settings: what its checks share, and the checks.
 
     Args:
-        settings: an instance of the entry's `config_class`. source: of its readings; None: a simulated
-            session of the whisker head, whose readings are `Whisk`s.
+        source: of its readings; None: a simulated session of the whisker head, whose readings are `Whisk`s.
     """
 
     def __init__(self, entry: TouchEntry, settings: Any, source: Source | None = None) -> None:
-        self.entry, self.settings = entry, settings
+        super().__init__(entry, settings)
         self.source = source or HeadSimulation(SimulationConfig(), HeadConfig())
 
     def build(self) -> ReadingProcessor:
@@ -94,10 +81,6 @@ class TouchTrial:
     def observations(self) -> list[tuple[str, Observation]]:
         """The observations among the results, each with its name."""
         return [(f"the observation of reading {k}", o) for k, o in enumerate(self.results) if o is not None]
-
-    @check(BUILT, "the entry is complete", "a configuration names it with its settings")
-    def entry_is_complete(self) -> None:
-        require_settings_class(self.entry.config_class)
 
     @check(BUILT, "it builds for the source", "the backend is built from its attributes")
     def builds(self) -> str:
@@ -171,7 +154,3 @@ class TouchTrial:
             found.append(first.observe(reading))
             second.observe(self.readings[k // 2])  # another pass, at another place
         require_equal(expected, found, "the results of a pass alone and beside another one")
-
-
-CHECKS = checks_of(TouchTrial)
-"""All checks of a touch front end."""
