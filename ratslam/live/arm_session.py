@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from evaluation.metrics.trajectory import read_tum
+from ratslam.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from ratslam.live.goal_planner import GoalPlanner, contact_map
 from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status, quantiles
 from ratslam.live.mapper_process import Mapper, MappingJob
@@ -30,7 +31,6 @@ from robot.live.arm_route import (
     plan_scene,
     whole_path,
 )
-from robot.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from robot.live.live_rig import Rig
 from robot.live.polling import SessionFault, session_fault
 from robot.live.selftest import find_devices, start_and_check
@@ -67,10 +67,9 @@ def plan_goals(config: RunConfig) -> tuple[RunConfig, GoalRoute]:
         config = config.model_copy(update={"live": live})
     made = saved.open_session().map
     planner = GoalPlanner(made.graph(), goal, live.plan.motion)
-    drive = GoalDrive(goal, planner, saved.config.pose_cells.cell_size, len(goal.to))
+    drive = GoalDrive(goal, planner, saved.config.pose_cells.cell_size)
     contacts = contact_map(made, config.touch.image, ur10_head(config.touch.head))
-    route = GoalRoute(drive, live, drive.off_way, goal.coast, contacts)
-    return localising(config, saved, goal.start), route
+    return localising(config, saved, goal.start), GoalRoute(drive, live, contacts)
 
 
 class GoalSteering:

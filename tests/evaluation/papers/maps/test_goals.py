@@ -21,7 +21,7 @@ from evaluation.papers.maps.goals import (
 from evaluation.papers.maps.scenarios import Recipe, touch_config
 from evaluation.papers.maps.stored_maps import store_map
 from evaluation.papers.tables.touch_table import MAIN
-from robot.live.goal_drive import DriveState
+from ratslam.live.goal_drive import DriveState
 from robot.world.maze import cell_centre
 from tests.evaluation.papers.maps.stand_ins import cells_by_figure
 
