@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status
+from ratslam.live.live_robot import LiveRobot, mapped_config, mapper_status
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
-from robot.drivers.outcome import SessionOutcome
 from robot.live.create_rig import CreateRig, run_create_loop
-from robot.live.selftest import find_devices, start_and_check
 from robot.simulation.create.simulated_session import CreateSimulationConfig, describe_create
 from robot.simulation.create.state_machine import CreateState
 from robot.world.arena import make_arena, wall_segments
@@ -41,15 +39,15 @@ def prepare_create_session(
     return lambda stopped: CreateSession(config, directory, stopped)
 
 
-class CreateSession:
-    """The Create's part of a session (`ratslam.live.live_robot.LiveRobot`).
+class CreateSession(LiveRobot):
+    """The Create's part of a session.
 
     Args:
         stopped: whether the operator has requested the end.
     """
 
-    end = SessionOutcome.COMPLETE
     unit = "report"
+    rig: CreateRig
 
     def __init__(self, config: RunConfig, directory: Path, stopped: Callable[[], bool]) -> None:
         assert config.live is not None
@@ -58,25 +56,11 @@ class CreateSession:
         plan = config.live.create.plan
         self.job = _mapping_job(config, plan, directory)
         self.total = plan.reports
-        self._count = 0
         self._ends: Counter[StepEnd] = Counter()
-
-    @property
-    def count(self) -> int:
-        return self._count
-
-    def prepare(self, mapper: Mapper, log: Callable[[str], None]) -> None:
-        """Finds and tests the devices; nothing moves."""
-        for line in find_devices(self.rig):
-            log(line)
-        compile_mapper(self.rig, mapper, self.job, log)
-        for line in start_and_check(self.rig):
-            log(line)
-        begin_mapping(self.rig, mapper, None)
 
     def run(self, mapper: Mapper, tell: Callable[[str], None]) -> None:
         def count(time: float, state: CreateState, moment: StepEnd) -> None:
-            self._count += 1
+            self.count += 1
             self._ends[moment] += 1
             ends = ", ".join(f"{self._ends[end]} {end.name}" for end in StepEnd if end is not StepEnd.FREE)
             tell(f"{mapper_status(mapper)}{time:.0f} s, {state.name}, {ends}")

@@ -16,16 +16,19 @@ from evaluation.metrics.scorecard import Scorecard
 from ratslam.live.arm_session import prepare_arm_session
 from ratslam.live.create_session import prepare_create_session
 from ratslam.live.live_robot import RECORDING, LiveRobot, quantiles
-from ratslam.live.mapper_process import Mapper, MappingJob
+from ratslam.live.mapper_process import Mapper
 from ratslam.runs.run import catch_interrupt
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.processes import urgent
 from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
-from robot.live.selftest import check_disk
+from robot.live.selftest import check_disk, find_devices, start_and_check
 from tactile.base.files import require_new_file
 from tactile.calibration import Calibration
+
+START_TIMEOUT = 300.0
+"""Time limit of the mapper's start, with compilation, s."""
 
 
 def run_live_session(
@@ -62,10 +65,17 @@ def run_live_session(
         try:
             with robot.rig as rig:
                 try:
-                    calibration = robot.prepare(mapper, log)
+                    calibration = _prepare(robot, mapper, log)
                     log("armed")
                     armed(directory)
-                    with open_recorder(robot.job, calibration) as rig.recorder:
+                    job = robot.job
+                    with LiveRecorder(
+                        job.directory / RECORDING,
+                        view_shape=job.view_shape,
+                        whiskers=job.whiskers,
+                        rate_hz=job.rate_hz,
+                        info=job.info.model_copy(update={"calibration": calibration}),
+                    ) as rig.recorder:
                         _run(robot, mapper)
                     fault = Fault(robot.end, f"{robot.count} {robot.unit}s", time.monotonic())
                 except SessionFault as error:
@@ -100,15 +110,21 @@ def _interruption(robot: LiveRobot) -> Fault:
     return Fault(SessionOutcome.INTERRUPTED, detail, time.monotonic())
 
 
-def open_recorder(job: MappingJob, calibration: Calibration | None) -> LiveRecorder:
-    """The recorder of the session."""
-    return LiveRecorder(
-        job.directory / RECORDING,
-        view_shape=job.view_shape,
-        whiskers=job.whiskers,
-        rate_hz=job.rate_hz,
-        info=job.info.model_copy(update={"calibration": calibration}),
-    )
+def _prepare(robot: LiveRobot, mapper: Mapper, log: Callable[[str], None]) -> Calibration | None:
+    """Finds, tests and calibrates the devices, while the mapper compiles and makes its run directory."""
+    rig, late = robot.rig, SessionOutcome.MAPPER_GONE
+    for line in find_devices(rig):
+        log(line)
+    log("mapper: compiling")
+    mapper.compile(robot.job)
+    rig.wait_until(mapper.compiled, START_TIMEOUT, late, "compiling")
+    for line in start_and_check(rig):
+        log(line)
+    calibration = robot.calibrate(log)
+    mapper.begin(calibration)
+    rig.wait_until(mapper.ready, START_TIMEOUT, late, "the mapper's start")
+    robot.lower(calibration)
+    return calibration
 
 
 def _run(robot: LiveRobot, mapper: Mapper) -> None:

@@ -31,7 +31,6 @@ from tactile.whisker_geometry import ur10_head
 
 LOG = "mapper.log"
 """Log of the mapper process, in the run directory."""
-NO_POINTS = np.zeros((0, 2))
 FINISH_TIMEOUT = 120.0
 """Time limit of scoring and plotting, s."""
 
@@ -62,19 +61,18 @@ class MappedSample(NamedTuple):
 
     Attributes:
         number: of the sample; a front end may add the motion of one to the next, which then has no result.
-            pose: [3] online, in the map frame (m, m, rad). place: -1 for none. action: by
-            name. seconds: computing time. doubt: see `ratslam.core.session.Step`. lost: whether
-            the method has lost track of the position. points: [n, 2] contacts in base_link, m.
+            pose: [3] online, in the map frame (m, m, rad). place: -1 for none. seconds: computing time.
+            doubt: see `ratslam.core.session.Step`. lost: whether the method has lost track of the position.
+            points: [n, 2] contacts in base_link, m.
     """
 
     number: int
     pose: np.ndarray
     place: int
-    action: str
     seconds: float
-    doubt: float = np.nan
-    lost: bool = False
-    points: np.ndarray = NO_POINTS
+    doubt: float
+    lost: bool
+    points: np.ndarray
 
 
 class Mapper:
@@ -266,7 +264,6 @@ def run_mapper(line: Connection) -> None:
 
 
 def _map(line: Connection) -> None:
-    from ratslam.core.estimates import Action
     from ratslam.live.goal_planner import felt_points
     from ratslam.runs.build_session import build_session
     from ratslam.runs.runner import check_finished_map, open_runner
@@ -302,8 +299,8 @@ def _map(line: Connection) -> None:
                 estimate, touch = step.estimate, config.touch
                 points = felt_points(sample.reading, touch.image, ur10_head(touch.head))
                 result = MappedSample(
-                    fed.count - 1, np.asarray(step.pose), int(estimate.place),
-                    Action(int(estimate.action)).name.lower(), took, step.doubt, bool(estimate.lost), points,
+                    fed.count - 1, np.asarray(step.pose), int(estimate.place), took, step.doubt,
+                    bool(estimate.lost), points,
                 )  # fmt: skip
                 _send(line, result)
             if runner.session.steps:

@@ -319,8 +319,10 @@ def check_source(
         InputError: there is no such source or front end, its package is broken, the settings do not fit, or
             the source refuses them, for example because a file is missing.
     """
-    named = {"settings": (SOURCES, name, "check source"), "touch": (TOUCH, touch, "--touch")}
-    parts, frontend = find_parts(named, assignments), None
+    parts = find_parts(
+        {"settings": (SOURCES, name, "check source"), "touch": (TOUCH, touch, "--touch")}, assignments
+    )
+    frontend = None
     if touch is not None:
         given = parts["touch"][1]
         plain = {} if given is None else json.loads(given.model_dump_json(exclude_unset=True))

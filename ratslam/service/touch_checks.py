@@ -36,8 +36,9 @@ def check_touch(name: str, assignments: Sequence[str] = (), source: str | None =
     Raises:
         InputError: there is no such front end or source, its package is broken, or the settings do not fit.
     """
-    named = {"settings": (TOUCH, name, "check touch"), "source": (SOURCES, source, "--source")}
-    parts = find_parts(named, assignments)
+    parts = find_parts(
+        {"settings": (TOUCH, name, "check touch"), "source": (SOURCES, source, "--source")}, assignments
+    )
     readings = None
     if source is not None:
         entry, settings = parts["source"]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Self
 
 import numpy as np
 
@@ -159,9 +158,6 @@ class CreateRig(PolledRig):
         self.robot.refresh()
         motion = self.robot.odometry()
         return self.robot.counts.good > good and not any(motion[:3])
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.robot.close()

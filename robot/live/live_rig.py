@@ -10,7 +10,6 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable
 from itertools import islice
-from typing import Self
 
 import numpy as np
 
@@ -198,9 +197,6 @@ class Rig(PolledRig):
         if self.recorder is not None:
             states["host"] -= self.epoch
             self.recorder.add_states(states)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is KeyboardInterrupt:  # second interrupt: stop by the dashboard server at once

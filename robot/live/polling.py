@@ -9,7 +9,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable, Iterator
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -149,6 +149,9 @@ class PolledRig:
                 raise session_fault(late, f"{what} took more than {longest:g} s")
             self.poll()
             time.sleep(TICK)
+
+    def __enter__(self) -> Self:
+        return self
 
     def record_event(self, name: str, text: str) -> None:
         """Records an event."""

@@ -34,18 +34,23 @@ FEWEST_ALIVE = 1
 """Least number of whiskers of a Create with a signal."""
 
 
-def check_arm_session(config: LiveConfig, head: HeadConfig, directory: Path) -> Iterator[str]:
-    """Checks what a session needs without starting a program on the arm, which then cannot move; yields
-    a line of text for each passed check.
+def check_session(config: LiveConfig, head: HeadConfig, directory: Path) -> Iterator[str]:
+    """Checks what a session needs, without a motion; yields a line of text for each passed check. No program
+    is started on an arm, which then cannot move.
 
     Args:
-        head: geometry of the whisker head. directory: in which the session would make its run directory.
+        head: geometry of an arm's whisker head. directory: in which the session would make its run directory.
 
     Raises:
         InputError: a check failed; the error gives its cure.
-        robot.live.polling.SessionFault: the head failed meanwhile.
+        robot.live.polling.SessionFault: a device failed meanwhile.
     """
     yield check_disk(config, directory)
+    if config.create is not None:
+        with CreateRig(config, lambda: False) as robot:
+            yield from find_devices(robot)
+            yield from start_and_check(robot)
+        return
     path = plan_path(config, ur10_head(head))
     check_targets(config, path)
     yield f"route: {path.duration:.0f} s, every target is within the arm's limits"
@@ -53,22 +58,6 @@ def check_arm_session(config: LiveConfig, head: HeadConfig, directory: Path) -> 
         yield from find_devices(rig)
         _check_stream(rig)
         yield f"clocks: head {rig.stream.clock.residual * 1e3:.1f} ms"
-
-
-def check_create(config: LiveConfig, directory: Path) -> Iterator[str]:
-    """Checks everything that a session needs, without a motion; yields a line for each passed check.
-
-    Args:
-        config: with a part `create`. directory: in which the session would make its run directory.
-
-    Raises:
-        InputError: a check failed; the error gives its cure.
-        robot.live.polling.SessionFault: a device failed meanwhile.
-    """
-    yield check_disk(config, directory)
-    with CreateRig(config, lambda: False) as rig:
-        yield from find_devices(rig)
-        yield from start_and_check(rig)
 
 
 def check_disk(config: LiveConfig, directory: Path) -> str:
