@@ -28,7 +28,7 @@ from ratslam.classic.config import NetworkConfig, network_of
 from ratslam.core.compilation import prepare_precision
 from ratslam.mapping.pose_graph import read_json
 from ratslam.runs.settings.run_config import load_config
-from ratslam.service.ros_bag import RosMessages, read_exported_run, write_bag, write_mcap
+from ratslam.service.ros_bag import RosRun
 from ratslam.service.spikes import (
     SpikeConfig,
     SpikeTrains,
@@ -193,16 +193,15 @@ def export_run(
     config = spikes or SpikeConfig()
     match suffix:
         case "" | ".mcap":
-            ros = RosMessages()
-            exported = read_exported_run(directory, warn)
-            if exported.run.has_pieces:
+            messages = RosRun(directory, warn)
+            if messages.run.has_pieces:
                 beside = "the file shows them beside each other, or each where it is true if that is known"
                 warn(f"{PARTED}; {beside}")
             if suffix:
-                make_new_file(output, lambda path: write_mcap(path, exported, ros))
+                make_new_file(output, messages.write_mcap)
                 return
             with new_folder(output) as folder:
-                write_bag(folder, output.name, exported, ros)
+                messages.write_bag(folder, output.name)
         case ".tum":
             _write_tum(directory, output, warn)
         case ".g2o" | ".json":
