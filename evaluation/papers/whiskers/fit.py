@@ -13,8 +13,8 @@ from evaluation.papers.whiskers.recordings import REACH, require_recordings
 from evaluation.plots import style
 from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
-from ratslam.service.record_fit import RevisitFit, fit_revisits, read_signals_of_reach
-from ratslam.service.rig_fit import WheelFit, fit_wheels
+from ratslam.service.record_fit import fit_revisits, read_signals_of_reach
+from ratslam.service.rig_fit import Rig, WheelFit, fit_wheels
 from robot.sources.in_memory import InMemorySource, load_into_memory, select_rows
 from robot.sources.odometry import UNCORRECTED, correct_motions
 from tactile.base.plugins import PluginConfig
@@ -45,7 +45,7 @@ class _RecordResult(NamedTuple):
     halves: tuple[WheelFit, WheelFit]
     before: tuple[float, float]
     after: tuple[float, float]
-    revisits: RevisitFit | None
+    revisits: Rig | None
 
 
 class _FitResult(NamedTuple):
@@ -152,7 +152,8 @@ def _table(result: _FitResult) -> list[str]:
         cells = ["; ".join(_pair(getattr(fit, key)) for fit in fits) for key in VALUES]
         lines.append(f"| {name} | {' | '.join(cells)} |")
         if record.revisits is not None:
-            turn, bias = _pair(record.revisits.turn_scale), _pair(record.revisits.heading_bias)
+            known = {one.name: (one.value, one.sd or 0.0) for one in record.revisits.quantities}
+            turn, bias = _pair(known.get("turn scale")), _pair(known["heading bias"])
             lines.append(f"| {name}, from revisits alone | not told by revisits | {turn} | {bias} |")
     lines += [
         "",
