@@ -6,7 +6,6 @@
 """
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.ndimage import uniform_filter1d
 
 import ratslam
@@ -51,23 +50,19 @@ def main() -> None:
     }
     line = "classic: {classic:.1g} m off the true path, recall {recall:.1g} m, odometry {odometry:.1g} m"
     print(line.format(**off))
-    _draw(aligned).savefig("places_that_look_alike.png")
 
-
-def _draw(paths: dict[str, np.ndarray]) -> Figure:
-    """The maps of both methods over the true path."""
     figure = new_figure(5.2, "Places that look alike", "two laps; the yellow stretches have the same views")
     for column, (method, color) in enumerate((("classic", VERMILLION), ("recall", BLUE))):
         axes = add_axes(figure, 0.62 + 3.7 * column, 1.0, 3.2, 3.3)
         for stretch in (slice(30, 70), slice(120, 160)):
-            axes.plot(*paths["truth"][stretch, :2].T, color=YELLOW, lw=7)
-        axes.plot(*paths["truth"][:, :2].T, color=INK, lw=0.8, label="truth")
-        axes.plot(*paths["odometry"][:, :2].T, color=GREY, lw=1, ls="--", label="odometry")
-        axes.plot(*paths[method][:, :2].T, color=color, lw=1.2, label=method)
+            axes.plot(*aligned["truth"][stretch, :2].T, color=YELLOW, lw=7)
+        axes.plot(*aligned["truth"][:, :2].T, color=INK, lw=0.8, label="truth")
+        axes.plot(*aligned["odometry"][:, :2].T, color=GREY, lw=1, ls="--", label="odometry")
+        axes.plot(*aligned[method][:, :2].T, color=color, lw=1.2, label=method)
         axes.set_aspect("equal")
         metre_grid(axes)
     add_legend(figure, axes)
-    return figure
+    figure.savefig("places_that_look_alike.png")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@
 from itertools import islice
 
 import numpy as np
-from matplotlib.figure import Figure
 
 import ratslam
 from evaluation.plots.style import INK, add_axes, name_axes, new_figure
@@ -28,11 +27,7 @@ def main() -> None:
         )  # [whisk, ring, column]
     touched = (images["contact_angle"] > 0).mean()
     print(f"{WHISKS} whisks of {images['contact_angle'][0].size} whiskers, {touched:.0%} of them in contact")
-    _draw(images).savefig("whisker_images.png")
 
-
-def _draw(images: dict[str, np.ndarray]) -> Figure:
-    """Some images of both transforms."""
     line = "a pixel a whisker: the height of the wall that it touches, dark for tall; white: no contact"
     figure = new_figure(3.2, "Whisker images", line)
     for row, (transform, views) in enumerate(images.items()):
@@ -49,7 +44,7 @@ def _draw(images: dict[str, np.ndarray]) -> Figure:
         color=INK,
         fontsize=9,
     )
-    return figure
+    figure.savefig("whisker_images.png")
 
 
 if __name__ == "__main__":

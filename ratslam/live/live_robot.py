@@ -73,10 +73,12 @@ def mapped_config(config: RunConfig, directory: Path, rows: int) -> RunConfig:
 
 def mapper_status(mapper: Mapper) -> str:
     """The newest result of the mapper as text: empty, or with a comma at its end."""
-    result = mapper.mapped[-1] if mapper.mapped else None
-    place = "" if result is None or result.place < 0 else f", place {result.place}"
-    place += "" if result is None or not result.doubt > DOUBTED else ", map_doubted"
-    return "" if result is None else f"map {1e3 * result.seconds:.0f} ms{place}, "
+    if not mapper.mapped:
+        return ""
+    result = mapper.mapped[-1]
+    place = f", place {result.place}" if result.place >= 0 else ""
+    doubted = ", map_doubted" if result.doubt > DOUBTED else ""
+    return f"map {1e3 * result.seconds:.0f} ms{place}{doubted}, "
 
 
 def quantiles(values: list[float]) -> dict[str, float]:

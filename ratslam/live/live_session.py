@@ -59,8 +59,9 @@ def run_live_session(
     require_new_file(directory, parents=True)
     open_robot = choose(config, directory)
     log(check_disk(config.live, directory))
-    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping, view) as mapper:
+    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping) as mapper:
         robot = open_robot(stopped)
+        robot.job = robot.job._replace(view=view)
         fault, standing, card = None, False, None
         try:
             with robot.rig as rig:
@@ -116,13 +117,11 @@ def _prepare(robot: LiveRobot, mapper: Mapper, log: Callable[[str], None]) -> Ca
     for line in find_devices(rig):
         log(line)
     log("mapper: compiling")
-    mapper.compile(robot.job)
-    rig.wait_until(mapper.compiled, START_TIMEOUT, late, "compiling")
+    rig.wait_until(mapper.prepare(robot.job), START_TIMEOUT, late, "compiling")
     for line in start_and_check(rig):
         log(line)
     calibration = robot.calibrate(log)
-    mapper.begin(calibration)
-    rig.wait_until(mapper.ready, START_TIMEOUT, late, "the mapper's start")
+    rig.wait_until(mapper.prepare(calibration), START_TIMEOUT, late, "the mapper's start")
     robot.lower(calibration)
     return calibration
 

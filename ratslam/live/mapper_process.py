@@ -12,8 +12,9 @@ import os
 import queue
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread
@@ -24,7 +25,7 @@ import numpy as np
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.processes import step_back, withheld_signals
-from robot.sources.source import Sample, SourceInfo
+from robot.sources.source import ClosedSource, Sample, SourceInfo
 from tactile.base.errors import InputError
 from tactile.calibration import Calibration
 from tactile.whisker_geometry import ur10_head
@@ -79,13 +80,13 @@ class Mapper:
     """Handle of the mapper process; a context manager. The process starts at once, to be ready early.
 
     Args:
-        process: its main function; None: `run_mapper`. view: target of a live view, or None.
+        process: its main function; None: `run_mapper`.
 
     Attributes:
         mapped: results of all samples mapped so far, in order.
     """
 
-    def __init__(self, process: Any = None, view: str | None = None) -> None:
+    def __init__(self, process: Any = None) -> None:
         context = multiprocessing.get_context("spawn")
         self._line, theirs = context.Pipe()
         target = process or run_mapper
@@ -94,8 +95,8 @@ class Mapper:
             self._process.start()
         theirs.close()
         self.mapped: list[MappedSample] = []
-        self._view = view
-        self._stages, self._failed = 0, ""
+        self._asked = self._stages = 0
+        self._failed = ""
         self._refusal: InputError | None = None
         self._card: Scorecard | None = None
         self._offered: list[float] = []
@@ -103,26 +104,25 @@ class Mapper:
         self._sender = Thread(target=self._send, daemon=True, name="to mapper")
         self._sender.start()
 
-    def compile(self, job: MappingJob) -> None:
-        """Sends the job, for which the process compiles. Returns at once; see `compiled`."""
-        self._outbox.put(job._replace(view=self._view))
+    def prepare(self, message: MappingJob | Calibration | None) -> Callable[[], bool]:
+        """Sends the job, for which the process compiles, and the next time the head's calibration (None
+        without one): the process then makes its run directory and is ready for samples.
 
-    def begin(self, calibration: Calibration | None) -> None:
-        """Sends the head's calibration, if it has one: the process makes its directory. Returns at once; see
-        `ready`."""
-        self._outbox.put(calibration)
-
-    def compiled(self) -> bool:
-        """Whether the mapper has compiled.
-
-        Raises:
-            InputError: the job was refused, or the process has ended.
+        Returns:
+            at once, a function that says whether the process has done so; it raises `InputError` if the job
+            was refused, or the process has ended.
         """
-        return self._completed_stages() >= 1
+        self._outbox.put(message)
+        self._asked += 1
+        return partial(self._has_done, self._asked)
 
-    def ready(self) -> bool:
-        """Whether the mapper is ready for samples; errors as of `compiled`."""
-        return self._completed_stages() >= 2
+    def _has_done(self, stages: int) -> bool:
+        self.receive()
+        if self._refusal is not None:
+            raise self._refusal
+        if not self.alive:
+            raise InputError("live", f"the mapper ended: {self.failure}", "")
+        return self._stages >= stages
 
     def offer(self, sample: Sample) -> None:
         """Passes the next sample; returns at once."""
@@ -176,14 +176,6 @@ class Mapper:
             self.receive()
         return self._card
 
-    def _completed_stages(self) -> int:
-        self.receive()
-        if self._refusal is not None:
-            raise self._refusal
-        if not self.alive:
-            raise InputError("live", f"the mapper ended: {self.failure}", "")
-        return self._stages
-
     def _send(self) -> None:
         while True:
             message = self._outbox.get()
@@ -205,7 +197,7 @@ class Mapper:
         self._line.close()
 
 
-class PipeSource:
+class PipeSource(ClosedSource):
     """The samples received through a pipe, as a source.
 
     Attributes:
@@ -222,14 +214,6 @@ class PipeSource:
         self.received, self.count = 0.0, 0
         self._line = line
 
-    def calibrate(self) -> None:
-        """Waits for the head's calibration and adds it to the information.
-
-        Raises:
-            EOFError: the parent has ended.
-        """
-        self.info = self.info.model_copy(update={"calibration": self._line.recv()})
-
     def __iter__(self) -> Iterator[Sample]:
         while True:
             try:
@@ -241,12 +225,6 @@ class PipeSource:
                 return
             self.received, self.count = time.monotonic(), self.count + 1
             yield message
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
 
 
 def run_mapper(line: Connection) -> None:
@@ -285,7 +263,7 @@ def _map(line: Connection) -> None:
         gc.collect()
         gc.freeze()  # what compiling has left need not be searched again: a full collection takes 0.1 s
         line.send(True)
-        fed.calibrate()
+        fed.info = fed.info.model_copy(update={"calibration": line.recv()})  # EOFError: the parent has ended
         source = open_touch_source(fed, config.touch)
         with open_runner(config, source, job.directory, session=session, observers=observers) as runner:
             # Sends the output of the process, including tracebacks, to a file: the terminal is the parent's.
