@@ -165,10 +165,27 @@ class ArmSession(LiveRobot):
         self._config = config
         self._approach, self._descent, self._route = arm_routes(config.live, path)
         self.rig = Rig(config.live, config.touch.head, stopped)
-        self.job = _mapping_job(config, directory)
-        self.total = config.live.whisks or (
-            None if goals else ceil(path.duration * config.live.plan.whisking.rate)
+        live, plan, head = config.live, config.live.plan, ur10_head(config.touch.head)
+        whole, rate = whole_path(live, head), plan.whisking.rate
+        rows = ceil(1.5 * whole.duration * rate) if live.whisks is None else live.whisks
+        maze = None if live.waypoints else maze_info(plan_scene(plan, head).maze, plan.maze, plan.seed)
+        provenance = {"live": live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})}
+        self.job = MappingJob(
+            mapped_config(config, directory, rows),
+            SourceInfo(
+                raw_whiskers=True,
+                cell_size=POSE_CELL_SIZE,
+                head=config.touch.head,
+                maze=maze,
+                provenance=provenance,
+            ),
+            directory,
+            view_shape(config.touch.image, head),
+            len(head.length),
+            rate,
+            float(np.abs(whole.pose[:, :2] - whole.pose[0, :2]).max()),
         )
+        self.total = live.whisks or (None if goals else ceil(path.duration * rate))
         self._goals = goals
         self._steering: GoalSteering | None = None
         self._whisks: list[WhiskReport] = []
@@ -224,32 +241,4 @@ class ArmSession(LiveRobot):
             **({} if self._steering is None else {"goals": self._steering.ends}),
             "lateness_s": quantiles([whisk.lateness for whisk in self._whisks]),
             "state_age_s": quantiles(self.rig.state_ages),
-            "head": self.rig.head.decoder.counts._asdict() | {"stalls": self.rig.head.stalls},
         }
-
-
-def _mapping_job(config: RunConfig, directory: Path) -> MappingJob:
-    """The job of the mapper, with the description of the robot for the recording."""
-    assert config.live is not None
-    head = ur10_head(config.touch.head)
-    plan = config.live.plan
-    path = whole_path(config.live, head)
-    rate = plan.whisking.rate
-    rows = ceil(1.5 * path.duration * rate) if config.live.whisks is None else config.live.whisks
-    return MappingJob(
-        mapped_config(config, directory, rows),
-        SourceInfo(
-            raw_whiskers=True,
-            cell_size=POSE_CELL_SIZE,
-            head=config.touch.head,
-            maze=None
-            if config.live.waypoints
-            else maze_info(plan_scene(plan, head).maze, plan.maze, plan.seed),
-            provenance={"live": config.live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})},
-        ),
-        directory,
-        view_shape(config.touch.image, head),
-        len(head.length),
-        rate,
-        float(np.abs(path.pose[:, :2] - path.pose[0, :2]).max()),
-    )

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.live.goal_planner import RECENT, GoalPlanner
-from ratslam.places.contact_alignment import RememberedContacts
+from ratslam.places.contact_alignment import RememberedContacts, placed_points
 from ratslam.places.route import NoWay
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.arm_route import MovableArm
@@ -219,12 +219,6 @@ def _lengths(way: np.ndarray) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))])
 
 
-def _points_in_map(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """[n, 2] points in base_link, seen from a pose [3] in the map."""
-    points = np.asarray(points, float).reshape(-1, 2)
-    return compose(pose, np.column_stack([points, np.zeros(len(points))]))[:, :2]
-
-
 SCATTER = 0.02
 """Largest distance of the poses of a way from its legs, m."""
 ALONG = 0.35
@@ -358,7 +352,7 @@ class GoalRoute:
             self.pose = None
             return self.rest()
         now = compose(self.pose, between(arm_pose, arm_now))
-        state = self.drive.observe(now, _points_in_map(self.pose, points), sure)
+        state = self.drive.observe(now, placed_points(self.pose[None], [points]), sure)
         if self.drive.target is not None:
             self._target = compose(arm_now, between(now, self.drive.target))
         return state
@@ -375,7 +369,7 @@ class GoalRoute:
         self.pose = self._contacts.align(self.pose, points)
         # The map does not have the obstacles that were found on the way.
         found = self.drive.obstacles
-        away = np.linalg.norm(_points_in_map(self.pose, points)[:, None] - found, axis=-1)
+        away = np.linalg.norm(placed_points(self.pose[None], [points])[:, None] - found, axis=-1)
         agrees = self._contacts.agrees(self.pose, points[(away > NEW).all(axis=1)])
         if estimate is None:
             self._unseen = self._unseen if agrees else np.inf
@@ -384,8 +378,8 @@ class GoalRoute:
 
     def _recent_points(self, arm_pose: np.ndarray) -> np.ndarray:
         """[n, 2] contacts of the last whisks, as seen from a pose of the arm, m."""
-        seen = [_points_in_map(between(arm_pose, before), points) for before, points in self._recent]
-        return np.concatenate(seen)
+        poses, points = zip(*self._recent, strict=True)
+        return placed_points(np.array([between(arm_pose, before) for before in poses]), points)
 
     def _correct(self, estimate: np.ndarray, points: np.ndarray) -> bool:
         """Moves the pose towards the estimate, unless only the pose as it is agrees with the last contacts

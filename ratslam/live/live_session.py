@@ -81,34 +81,31 @@ def run_live_session(
                     fault = Fault(robot.end, f"{robot.count} {robot.unit}s", time.monotonic())
                 except SessionFault as error:
                     fault = error.fault
-                except OperatorStop:
-                    fault = _interruption(robot)
-                except KeyboardInterrupt:  # a second one
-                    fault = _interruption(robot)
-                    raise
+                except (OperatorStop, KeyboardInterrupt) as error:
+                    done = f"after {robot.count} {robot.unit}s, which `run` on the recording maps"
+                    detail = done if robot.count else "nothing was recorded"
+                    fault = Fault(SessionOutcome.INTERRUPTED, detail, time.monotonic())
+                    if isinstance(error, KeyboardInterrupt):  # a second one
+                        raise
                 standing = rig.rest()
             if robot.count:
                 card = mapper.finish(not fault.outcome.planned)
         finally:
             if fault is not None:
+                head = robot.rig.head
                 report = {
                     "outcome": fault.outcome.name.lower(),
                     "detail": fault.detail,
                     "standing": standing,
                     f"{robot.unit}s": robot.count,
                     **robot.report(),
+                    "head": head.decoder.counts._asdict() | {"stalls": head.stalls},
                     "mapper_s": quantiles([result.seconds for result in mapper.mapped]),
                 }
                 text = json.dumps(report, indent=2) + "\n"
                 with suppress(OSError):  # a full disk has been reported
                     (directory / SESSION_REPORT).write_text(text, encoding="utf-8")
     return fault, card
-
-
-def _interruption(robot: LiveRobot) -> Fault:
-    done = f"after {robot.count} {robot.unit}s, which `run` on the recording maps"
-    detail = done if robot.count else "nothing was recorded"
-    return Fault(SessionOutcome.INTERRUPTED, detail, time.monotonic())
 
 
 def _prepare(robot: LiveRobot, mapper: Mapper, log: Callable[[str], None]) -> Calibration | None:
