@@ -24,6 +24,7 @@ from robot.drivers.processes import urgent
 from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
 from robot.live.selftest import check_disk, find_devices, start_and_check
+from robot.recordings.mcap_writer import McapWriter
 from tactile.base.files import require_new_file
 from tactile.calibration import Calibration
 
@@ -70,13 +71,14 @@ def run_live_session(
                     log("armed")
                     armed(directory)
                     job = robot.job
-                    with LiveRecorder(
+                    tape = McapWriter(
                         job.directory / RECORDING,
                         view_shape=job.view_shape,
                         whiskers=job.whiskers,
                         rate_hz=job.rate_hz,
                         info=job.info.model_copy(update={"calibration": calibration}),
-                    ) as rig.recorder:
+                    )
+                    with LiveRecorder(tape) as rig.recorder:
                         _run(robot, mapper)
                     fault = Fault(robot.end, f"{robot.count} {robot.unit}s", time.monotonic())
                 except SessionFault as error:

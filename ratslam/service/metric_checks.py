@@ -39,19 +39,11 @@ def check_metric(name: str, assignments: Sequence[str] = ()) -> Iterator[Result]
 
 
 class MetricTrial(Trial[MetricEntry]):
-    """A metric with settings: the runs that its checks share, and the checks."""
+    """A metric with settings, and its checks."""
 
     @cached_property
     def metric(self) -> Metric:
         return self.entry.build(self.settings)
-
-    @cached_property
-    def with_truth(self) -> RunData:
-        return _data(_synthetic_run())
-
-    @cached_property
-    def without_truth(self) -> RunData:
-        return _data(_synthetic_run()._replace(truth=None))
 
     @check(ENTRY, "name, label and unit are well-formed", "scorecard.json and tables show them")
     def is_named(self) -> str:
@@ -75,7 +67,7 @@ class MetricTrial(Trial[MetricEntry]):
     @check(VALUES, "it computes with truth", "a scorecard holds numbers")
     def computes_with_truth(self) -> str:
         what = "a run with truth"
-        result = self.metric.compute(self.with_truth)
+        result = self.metric.compute(_data(_synthetic_run()))
         require(result is not None, f"None for {what}", "a Finding; None means that there is no truth")
         found = _require_finding(result, what)
         self.metric.quantity(found)
@@ -83,7 +75,7 @@ class MetricTrial(Trial[MetricEntry]):
 
     @check(VALUES, "it does without truth", "most recordings have none")
     def computes_without_truth(self) -> str:
-        result = self.metric.compute(self.without_truth)
+        result = self.metric.compute(_data(_synthetic_run()._replace(truth=None)))
         if result is None:
             return "no ground truth"
         found = _require_finding(result, "a run without truth")

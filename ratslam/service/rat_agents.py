@@ -17,7 +17,7 @@ from ratslam.classic import pose_cells
 from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.levels import point_activity, to_full_torus, window_levels
 from ratslam.classic.pose_cells import LARGEST_SUBSTEP, MOST_SUBSTEPS, Outcome, PoseCells
-from ratslam.service.spikes import cell_poses, check_cells, settled_peak
+from ratslam.service.spikes import cell_poses, settled_peak
 from robot.simulation.rat.box import BoxConfig
 from robot.simulation.rat.rat_path import RatOdometryConfig, RatPath, measure_motion
 from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
@@ -243,9 +243,8 @@ class PoseCellNeurons(Neurons):
         config: NetworkConfig = given["pose_cells"]
         shape = (config.cells_heading, config.cells_xy, config.cells_xy)
         cell = np.arange(np.prod(shape)) if given["cell"] is None else np.asarray(given["cell"])
-        check_cells(shape, cell)
-        super().__init__(Agent, {**given, "cell": cell, "n": len(cell)})
         self.cell_poses = cell_poses(shape, config.cell_size, cell)
+        super().__init__(Agent, {**given, "cell": cell, "n": len(cell)})
         self._peak = settled_peak(config)
         self._random = stream(self.seed, f"pose cell neurons {self.name}")
         self._pose, self._time = agent_pose(Agent), float(Agent.t)

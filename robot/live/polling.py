@@ -160,25 +160,14 @@ class PolledRig:
 
 
 class AsyncMapper(Protocol):
-    """Asynchronous mapper interface."""
+    """The methods of `ratslam.live.mapper_process.Mapper` that a loop calls."""
 
     @property
-    def alive(self) -> bool:
-        """Whether the mapper runs."""
-        ...
-
+    def alive(self) -> bool: ...
     @property
-    def failure(self) -> str:
-        """Reason for the end of the mapper."""
-        ...
-
-    def behind(self) -> float:
-        """Waiting time of the oldest unmapped sample, s."""
-        ...
-
-    def offer(self, sample: Sample) -> None:
-        """Passes the next sample; returns at once."""
-        ...
+    def failure(self) -> str: ...
+    def behind(self) -> float: ...
+    def offer(self, sample: Sample) -> None: ...
 
 
 def check_mapper(mapper: AsyncMapper) -> None:

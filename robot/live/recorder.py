@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from threading import Lock
 from typing import Self
 
@@ -31,7 +30,7 @@ from robot.recordings.cdr import (
     encode_truth,
 )
 from robot.recordings.mcap_writer import McapWriter, RecordingWriteError
-from robot.sources.source import Sample, SourceInfo
+from robot.sources.source import Sample
 
 BLOCK_TIME = 0.15
 """Time for which frames and states are collected into a block, s."""
@@ -44,26 +43,15 @@ class LiveRecorder:
     ignored, and the recording stays readable up to that point.
 
     Args:
-        path: must not exist yet. view_shape, whiskers, rate_hz, info: see `McapWriter`.
+        tape: the new file.
 
     Attributes:
         fault: the error that ended writing, or None.
-
-    Raises:
-        InputError: the file exists or cannot be created.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        view_shape: tuple[int, int, int],
-        whiskers: int,
-        rate_hz: float = 0.0,
-        info: SourceInfo,
-    ) -> None:
+    def __init__(self, tape: McapWriter) -> None:
         self.fault: Fault | None = None
-        self._tape = McapWriter(path, view_shape=view_shape, whiskers=whiskers, rate_hz=rate_hz, info=info)
+        self._tape = tape
         self._lock = Lock()
         self._frames: list[Frames] = []
         self._states: list[np.ndarray] = []

@@ -32,6 +32,7 @@ from robot.recordings.cdr import (
 )
 from robot.recordings.mcap_reader import Recording
 from robot.recordings.mcap_scanner import McapScanner
+from robot.recordings.mcap_writer import McapWriter
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle
 from tests.robot.live.live_recordings import (
@@ -290,6 +291,8 @@ def test_an_unseen_cut_needs_no_frames(tmp_path: Path, refused: Callable[..., In
     assert sample.reading.odometry == motion_of_whisk(0)
     assert isinstance(cut, Cut)
     refused(
-        lambda: LiveRecorder(tmp_path / "a.mcap", view_shape=(1, 1, 1), whiskers=1, info=INFO),
+        lambda: LiveRecorder(
+            McapWriter(tmp_path / "a.mcap", view_shape=(1, 1, 1), whiskers=1, rate_hz=0.0, info=INFO)
+        ),
         "exists already",
     )

@@ -36,11 +36,12 @@ import numpy as np
 from robot.drivers.head.decoder import Frames
 from robot.drivers.head.decoder import Cut
 from robot.live.recorder import LiveRecorder
+from robot.recordings.mcap_writer import McapWriter
 from robot.sources.source import SourceInfo
 from tactile.base.types import Odometry
 
 path, beside = map(Path, sys.argv[1:])
-recorder = LiveRecorder(path, view_shape=(3, 6, 1), whiskers=18, info=SourceInfo())
+recorder = LiveRecorder(McapWriter(path, view_shape=(3, 6, 1), whiskers=18, rate_hz=0.0, info=SourceInfo()))
 random = np.random.default_rng(0)
 pool = random.integers(-300, 300, (2000, 18, 3)).astype(np.int16)
 with beside.open("r+b") as file:
