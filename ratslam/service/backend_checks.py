@@ -79,19 +79,27 @@ class BackendTrial(Trial[BackendEntry]):
                 found[name] = str(error)
         return found
 
-    @property
-    def refusals(self) -> dict[str, str]:
-        """For sensors that the method refuses with an `InputError`: its text."""
-        return {name: made for name, made in self._built.items() if isinstance(made, str)}
-
     @cached_property
     def sensors(self) -> Sensors:
         """The sensors of the walks: with whiskers, unless the method refuses them."""
-        return next(sensors for name, sensors in SENSORS.items() if name not in self.refusals)
+        return next(SENSORS[name] for name, made in self._built.items() if not isinstance(made, str))
 
     def walk(self, count: int, seed: int = 0) -> list[Observation]:
-        """The first observations of a walk."""
-        return list(walk(count, seed, 0 if self.sensors.feelers is None else WHISKERS))
+        """The first observations of laps of a small circuit with repeated views; some steps have no view, and
+        in some the whiskers are in contact."""
+        stream, touch = np.random.default_rng(seed), np.random.default_rng([seed, 1])
+        whiskers = 0 if self.sensors.feelers is None else WHISKERS
+        places, walked = stream.random((CIRCUIT, *VIEW)), []
+        for k in range(count):
+            turn = 2 * np.pi / CIRCUIT + stream.normal(0, 0.01)
+            odometry = Odometry(0.05 + stream.normal(0, 0.002), stream.normal(0, 0.002), turn, 0.1)
+            seen, place = stream.random() > 0.1, k % CIRCUIT
+            view, label = (places[place], place) if seen else (None, -1)
+            o = observation(odometry, view, view_shape=VIEW, label=label, whiskers=whiskers)
+            contact = touch.random(WHISKERS)[:whiskers] < (0.2 if k % 5 == 0 else 0.0)
+            point = np.where(contact[:, None], REACH * _around[:whiskers], 0.0)
+            walked.append(o._replace(contact=contact, point=point))
+        return walked
 
     @property
     def backend(self) -> Backend:
@@ -159,7 +167,7 @@ class BackendTrial(Trial[BackendEntry]):
 
     @check(ENTRY, "it builds", "a run builds it from its settings and the sensors of the source")
     def builds(self) -> str:
-        refused = self.refusals
+        refused = {name: made for name, made in self._built.items() if isinstance(made, str)}
         if len(refused) == 2:
             found = "; ".join(f"{name}: {text}" for name, text in refused.items())
             raise Violation(found, "a backend for views of (3, 6, 1) with or without whiskers")
@@ -485,26 +493,6 @@ class BackendTrial(Trial[BackendEntry]):
             sound = isinstance(name, str) and isinstance(array, np.ndarray) and array.dtype != object
             found = f"{name!r}: {getattr(array, 'dtype', type(array).__name__)}"
             require(sound, found, "NumPy arrays of numbers by name")
-
-
-def walk(count: int, seed: int = 0, whiskers: int = WHISKERS) -> Iterator[Observation]:
-    """Laps of a small circuit with repeated views; some steps have no view, and in some the whiskers are in
-    contact."""
-    stream, touch = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-    places = stream.random((CIRCUIT, *VIEW))
-    for k in range(count):
-        turn = 2 * np.pi / CIRCUIT + stream.normal(0, 0.01)
-        odometry = Odometry(0.05 + stream.normal(0, 0.002), stream.normal(0, 0.002), turn, 0.1)
-        seen, place = stream.random() > 0.1, k % CIRCUIT
-        o = observation(
-            odometry,
-            places[place] if seen else None,
-            view_shape=VIEW,
-            label=place if seen else -1,
-            whiskers=whiskers,
-        )
-        contact = touch.random(WHISKERS)[:whiskers] < (0.2 if k % 5 == 0 else 0.0)
-        yield o._replace(contact=contact, point=np.where(contact[:, None], REACH * _around[:whiskers], 0.0))
 
 
 def _require_finite(steps: list[Step], what: str) -> None:

@@ -10,6 +10,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable
 from itertools import islice
+from operator import itemgetter
 
 import numpy as np
 
@@ -52,16 +53,11 @@ class ArmOdometry:
         while self._states and self._states[0][0] < self._states[-1][0] - HISTORY:
             self._states.popleft()
 
-    @property
-    def span(self) -> float:
-        """Time span of the stored states, s."""
-        return self._states[-1][0] - self._states[0][0] if self._states else 0.0
-
     def pose(self, time: float) -> np.ndarray:
         """Pose of the head in the map [3] at a time, interpolated between two states; outside
         their span, the nearest pose."""
         last = len(self._states) - 1
-        k = min(max(bisect_left(self._states, time, key=_time_of), 1), last)
+        k = min(max(bisect_left(self._states, time, key=itemgetter(0)), 1), last)
         pair = [self._states[max(k - 1, 0)], self._states[k]]
         poses, _ = self._config.arm.placing.pose_from_tcp(np.stack([state[1] for state in pair]))
         span = pair[1][0] - pair[0][0]
@@ -95,7 +91,7 @@ class ArmOdometry:
 
     def _integrate_velocity(self, start: np.ndarray, took: float, time: float) -> np.ndarray:
         """Pose reached from the last one at the mean velocity since then."""
-        since, until = (bisect_right(self._states, end, key=_time_of) for end in (time - took, time))
+        since, until = (bisect_right(self._states, end, key=itemgetter(0)) for end in (time - took, time))
         states = list(islice(self._states, since, until))
         if not states:
             return start
@@ -107,10 +103,6 @@ class ArmOdometry:
         mean = [np.array([0.0, part.mean()]) for part in (forward, left, speed[:, 5])]
         motion = from_velocities(times, mean[0], mean[1], mean[2], MIDPOINT)[1, :3]
         return compose(start, motion)
-
-
-def _time_of(state: tuple[float, np.ndarray, np.ndarray]) -> float:
-    return state[0]
 
 
 MAX_REST_TIME, REST_TIME = 2.0, 0.3
