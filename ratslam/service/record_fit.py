@@ -181,15 +181,13 @@ def fit_wheels_of(config: RunConfig, completed: RunConfig, samples: list[Sample]
 
 def _from_truth(fit: WheelFit, assumed: OdometryCorrection, completed: RunConfig) -> Rig:
     noise, cell = completed.keyframes.noise, completed.pose_cells.cell_size
-    quantities = [_of_wheels("length_scale", assumed, fit.length_scale)]
     unknown = []
     if fit.turn_scale is None:
         turned = f"the robot turns {fit.turned:.2g} rad in all"
         unknown.append(f"turn scale: {turned}; at least {LEAST_TURNED:.2g} rad are needed")
-    else:
-        quantities.append(_of_wheels("turn_scale", assumed, fit.turn_scale))
-    quantities += [
-        _of_wheels("heading_bias", assumed, fit.heading_bias),
+    known = {key: found for key in WHEELS if (found := getattr(fit, key)) is not None}
+    quantities = [
+        *(_of_wheels(key, assumed, found) for key, found in known.items()),
         Quantity("heading noise", noise.heading_per_cell / np.sqrt(cell), *fit.heading_noise, "rad/sqrt(m)"),
         Quantity("turn noise", noise.heading_per_radian, *fit.turn_noise, "rad/sqrt(rad)"),
         Quantity("position noise", noise.per_cell * np.sqrt(cell), *fit.position_noise, "m/sqrt(m)"),

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.runs.settings.strict_yaml import dump_data, merge_settings
-from robot.sources.odometry import OdometryCorrection, correct_motions
+from robot.sources.odometry import UNCORRECTED, OdometryCorrection, correct_motions
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.samples import robust_sd
@@ -65,11 +65,10 @@ class WheelFit(NamedTuple):
     @property
     def correction(self) -> OdometryCorrection:
         """The systematic errors beyond `KEPT_SDS`, as settings of a recording."""
-        return OdometryCorrection(
-            length_scale=_if_sure(self.length_scale, 1.0),
-            turn_scale=1.0 if self.turn_scale is None else _if_sure(self.turn_scale, 1.0),
-            heading_bias=_if_sure(self.heading_bias, 0.0),
-        )
+        found = {key: getattr(self, key) for key in ("length_scale", "turn_scale", "heading_bias")}
+        off = {key: pair[0] - getattr(UNCORRECTED, key) for key, pair in found.items() if pair}
+        sure = {key: found[key][0] for key in off if abs(off[key]) > KEPT_SDS * found[key][1]}
+        return OdometryCorrection(**sure)
 
 
 def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: int = 0) -> WheelFit:
@@ -87,7 +86,7 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
         if not starts or time[row] - time[starts[-1]] >= WINDOW:
             starts.append(row)
     ends = np.array(starts, int)
-    windows = _measure(motion, truth, ends, OdometryCorrection())
+    windows = _measure(motion, truth, ends, UNCORRECTED)
     path, turned = float(windows[0].sum()), float(windows[2].sum())
     if len(ends) - 1 < LEAST_WINDOWS or path == 0:
         found = f"{path:.3g} m in {max(len(ends) - 1, 0)} windows of {WINDOW:g} s with true poses"
@@ -101,22 +100,14 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
     off = true_turn - values[1] * turn - values[2] * length, true_chord - values[0] * chord
     slips = np.any([np.abs(error) > SLIP * robust_sd(error) for error in off], axis=0)
     return WheelFit(
-        length_scale=pairs[0],
-        turn_scale=pairs[1] if turns else None,
-        heading_bias=pairs[2],
-        heading_noise=pairs[3],
-        turn_noise=pairs[4],
-        length_noise=pairs[5],
-        position_noise=pairs[6],
+        pairs[0],
+        pairs[1] if turns else None,
+        *pairs[2:],
         windows=len(length),
         slips=int(slips.sum()),
         path=path,
         turned=turned,
     )
-
-
-def _if_sure(found: tuple[float, float], assumed: float) -> float:
-    return found[0] if abs(found[0] - assumed) > KEPT_SDS * found[1] else assumed
 
 
 def _measure(
