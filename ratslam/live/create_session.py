@@ -40,11 +40,7 @@ def prepare_create_session(
 
 
 class CreateSession(LiveRobot):
-    """The Create's part of a session.
-
-    Args:
-        stopped: whether the operator has requested the end.
-    """
+    """The Create's part of a session."""
 
     unit = "report"
     rig: CreateRig

@@ -96,8 +96,7 @@ class Mapper:
         theirs.close()
         self.mapped: list[MappedSample] = []
         self._asked = self._stages = 0
-        self._failed = ""
-        self._refusal: InputError | None = None
+        self._failed: InputError | str = ""  # a refusal of the job, or an error
         self._card: Scorecard | None = None
         self._offered: list[float] = []
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -118,8 +117,8 @@ class Mapper:
 
     def _has_done(self, stages: int) -> bool:
         self.receive()
-        if self._refusal is not None:
-            raise self._refusal
+        if isinstance(self._failed, InputError):
+            raise self._failed
         if not self.alive:
             raise InputError("live", f"the mapper ended: {self.failure}", "")
         return self._stages >= stages
@@ -144,24 +143,22 @@ class Mapper:
                     self.mapped.append(message)
                 elif isinstance(message, Scorecard):
                     self._card = message
-                elif isinstance(message, InputError):
-                    self._refusal = message
                 elif message is True:
                     self._stages += 1
                 else:
-                    self._failed = str(message)
+                    self._failed = message
         except (EOFError, OSError):
             self._failed = self._failed or "its connection broke"
 
     @property
     def alive(self) -> bool:
         """Whether the process runs and has reported no failure."""
-        return self._process.is_alive() and not self._failed and self._refusal is None
+        return self._process.is_alive() and not self._failed
 
     @property
     def failure(self) -> str:
         """Reason for the end of the mapper, as far as known."""
-        return self._failed or str(self._refusal or f"it ended with code {self._process.exitcode}")
+        return str(self._failed or f"it ended with code {self._process.exitcode}")
 
     def finish(self, interrupted: bool) -> Scorecard | None:
         """Waits for the score; None if the process has ended or mapped nothing.

@@ -503,14 +503,8 @@ def _require_finite(steps: list[Step], what: str) -> None:
 
 
 def check_backend(name: str, assignments: Sequence[str] = ()) -> Iterator[Result]:
-    """Checks the method registered under a name.
-
-    Args:
-        assignments: of its settings, each `settings.key=value`.
-
-    Raises:
-        InputError: there is no such method, its package is broken, or the settings do not fit it.
-    """
+    """Checks the method of a name, with its settings as assignments `settings.key=value`; raises as
+    `find_parts`."""
     entry, settings = find_parts({"settings": (BACKENDS, name, "check backend")}, assignments)["settings"]
     prepare_precision("float64")
     return BackendTrial(entry, settings).run_checks()

@@ -26,14 +26,8 @@ ENTRY, VALUES = range(2)
 
 
 def check_metric(name: str, assignments: Sequence[str] = ()) -> Iterator[Result]:
-    """Checks the metric registered under a name.
-
-    Args:
-        assignments: of its settings, each `settings.key=value`.
-
-    Raises:
-        InputError: there is no such metric, its package is broken, or the settings do not fit it.
-    """
+    """Checks the metric of a name, with its settings as assignments `settings.key=value`; raises as
+    `find_parts`."""
     entry, settings = find_parts({"settings": (METRICS, name, "check metric")}, assignments)["settings"]
     return MetricTrial(entry, settings).run_checks()
 

@@ -1,6 +1,7 @@
-"""Conformance checks of a source: its attributes, its samples, and that they can be read again.
+"""Conformance checks of a source and of a touch front end.
 
-`require_shapes` and `require_masked` serve the checks of front ends too.
+Of a source: its attributes, its samples, and that they can be read again. Of a front end, on the readings
+of a source: shapes, masks, motion, no memory.
 """
 
 from __future__ import annotations
@@ -24,17 +25,33 @@ from ratslam.service.check_results import (
     require,
     require_equal,
 )
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.source import SOURCES, ClosedSource, Sample, Source, SourceEntry, SourceInfo, rate_of
-from robot.touch_source import TOUCH, head_config_of, open_touch_source, report_config_of
+from robot.touch_source import (
+    TOUCH,
+    ReadingProcessor,
+    TouchEntry,
+    head_config_of,
+    open_touch_source,
+    report_config_of,
+)
 from tactile.base.errors import InputError
-from tactile.base.plugins import PluginConfig
+from tactile.base.plugins import NoSettings, PluginConfig
+from tactile.base.se2 import compose
 from tactile.base.types import Observation
 from tactile.frontend import TouchConfig
+from tactile.whisker_geometry import HeadConfig
 
 SAMPLES = 4096
 """Samples of a source that are examined unless said otherwise."""
+READINGS = 256
+"""Readings that are examined."""
+MOTION_TOLERANCE = 1e-6
+"""Difference allowed between motions, m, rad and s: front ends may round."""
+ATTRIBUTES = ("name", "rate_hz", "view_shape", "whiskers", "length", "digest", "info")
+METHODS = ("__iter__", "__enter__", "__exit__")
 OPENED, READ, OBSERVED = range(3)
-"""Groups of checks, in their order."""
+"""Groups of checks, in their order: of what is opened or built, of what is read, of what is made of it."""
 
 
 class Reading(NamedTuple):
@@ -180,12 +197,12 @@ class SourceTrial(Trial[SourceEntry]):
     def views_have_shapes(self) -> None:
         source = self.observing
         for k, observation in enumerate(self.observations):
-            require_shapes(observation, source.view_shape, source.whiskers, f"observation {k}")
+            _require_shapes(observation, source.view_shape, source.whiskers, f"observation {k}")
 
     @check(OBSERVED, "absent values are masked, not NaN", "one NaN spoils a step")
     def masks_values(self) -> None:
         for k, observation in enumerate(self.observations):
-            require_masked(observation, f"observation {k}", self.observing.info.signed_views)
+            _require_masked(observation, f"observation {k}", self.observing.info.signed_views)
 
     @check(OBSERVED, "truth is [3] or None", "scores are computed from it")
     def truth_is_pose(self) -> str:
@@ -263,7 +280,7 @@ class _StoredSource(ClosedSource):
         return iter(self._samples)
 
 
-def require_shapes(found: Any, view_shape: tuple[int, ...], whiskers: int, what: str) -> None:
+def _require_shapes(found: Any, view_shape: tuple[int, ...], whiskers: int, what: str) -> None:
     """Raises `Violation` unless this is an observation of these shapes, with the dtypes of each field.
 
     Args:
@@ -287,7 +304,7 @@ def require_shapes(found: Any, view_shape: tuple[int, ...], whiskers: int, what:
         require(fits, f"{path} of {what} is {text}", f"NumPy {names[kind]} {shape}")
 
 
-def require_masked(found: Observation, what: str, signed: bool = False) -> None:
+def _require_masked(found: Observation, what: str, signed: bool = False) -> None:
     """Raises `Violation` if an observation has NaN or infinite values, or a view outside 0..1.
 
     Args:
@@ -301,10 +318,6 @@ def require_masked(found: Observation, what: str, signed: bool = False) -> None:
         require(low >= 0 and high <= 1, f"view of {what} has values {low:g} to {high:g}", "values in 0..1")
 
 
-ATTRIBUTES = ("name", "rate_hz", "view_shape", "whiskers", "length", "digest", "info")
-METHODS = ("__iter__", "__enter__", "__exit__")
-
-
 def check_source(
     name: str, assignments: Sequence[str] = (), touch: str | None = None, most: int = SAMPLES
 ) -> Iterator[Result]:
@@ -316,8 +329,7 @@ def check_source(
         most: samples to examine.
 
     Raises:
-        InputError: there is no such source or front end, its package is broken, the settings do not fit, or
-            the source refuses them, for example because a file is missing.
+        InputError: as `find_parts`, or the source refuses its settings, for example because a file is missing.
     """
     parts = find_parts(
         {"settings": (SOURCES, name, "check source"), "touch": (TOUCH, touch, "--touch")}, assignments
@@ -339,3 +351,134 @@ def check_source(
 
 def _is_count(value: Any, least: int = 0) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= least
+
+
+class TouchTrial(Trial[TouchEntry]):
+    """A touch front end with settings: what its checks share, and the checks.
+
+    Args:
+        source: of its readings; None: a simulated session of the whisker head, whose readings are `Whisk`s.
+    """
+
+    def __init__(self, entry: TouchEntry, settings: Any, source: Source | None = None) -> None:
+        super().__init__(entry, settings)
+        self.source = source or HeadSimulation(SimulationConfig(), HeadConfig())
+
+    def build(self) -> ReadingProcessor:
+        """A new front end, as for a pass through the source."""
+        return self.entry.build(self.settings, self.source.info)
+
+    @cached_property
+    def first(self) -> ReadingProcessor:
+        return self.build()
+
+    @cached_property
+    def reading(self) -> Reading:
+        return Reading.of(self.source, READINGS)
+
+    @property
+    def readings(self) -> list[Any]:
+        """The readings of the first samples."""
+        return [sample.reading for sample in self.reading.samples]
+
+    @cached_property
+    def results(self) -> list[Observation | None]:
+        """What the first front end makes of each reading."""
+        return [self.first.observe(reading) for reading in self.readings]
+
+    def observations(self) -> list[tuple[str, Observation]]:
+        """The observations among the results, each with its name."""
+        return [(f"the observation of reading {k}", o) for k, o in enumerate(self.results) if o is not None]
+
+    @check(OPENED, "it builds for the source", "the backend is built from its attributes")
+    def builds(self) -> str:
+        front, source = self.first, self.source
+        missing = [name for name in ("view_shape", "whiskers", "observe") if not hasattr(front, name)]
+        require(
+            not missing, f"{type(front).__name__} without {', '.join(missing)}", "all of a ReadingProcessor"
+        )
+        shape, whiskers = front.view_shape, front.whiskers
+        counts = (
+            isinstance(shape, tuple) and len(shape) == 3 and all(isinstance(n, int) and n > 0 for n in shape)
+        )
+        require(counts, f"view_shape {shape!r}", "a tuple of three sizes (R, C, K)")
+        found = f"{whiskers} whiskers for those of {source.name}"
+        require(whiskers == source.whiskers, found, f"{source.whiskers}, as the source says")
+        return f"view_shape {shape}, {whiskers} whiskers"
+
+    @check(READ, "observations have the declared shapes", "the kernel is compiled for them")
+    def views_have_shapes(self) -> str:
+        observations = self.observations()
+        found = f"None for all {len(self.results)} readings of {self.source.name}"
+        require(len(observations) > 0, found, "an observation for some of them")
+        for what, one in observations:
+            _require_shapes(one, self.first.view_shape, self.first.whiskers, what)
+        return f"{len(observations)} observations of {len(self.results)} readings of {self.source.name}"
+
+    @check(OBSERVED, "absent values are masked, not NaN", "one NaN spoils a step")
+    def masks_values(self) -> None:
+        for what, one in self.observations():
+            _require_masked(one, what)
+
+    @check(OBSERVED, "no motion is lost", "the pose is the sum of all motions")
+    def carries_motion(self) -> str:
+        if not all(hasattr(reading, "odometry") for reading in self.readings):
+            return "readings without odometry"
+        waiting: list[Any] = []
+        for k, (reading, result) in enumerate(zip(self.readings, self.results, strict=True)):
+            waiting.append(reading.odometry)
+            if result is None:
+                continue
+            if len(waiting) > 1:
+                together = np.zeros(3)  # m, m, rad, of successive motions
+                for motion in waiting:
+                    together = compose(together, np.array(motion[:3], float))
+                expected = np.append(together, sum(float(motion[3]) for motion in waiting))
+                found = np.array(result.odometry, float)
+                if not np.allclose(expected, found, rtol=0, atol=MOTION_TOLERANCE):
+                    what = f"odometry {found.tolist()} in the observation of reading {k} after None"
+                    raise Violation(what, f"{expected.tolist()}, with the motion of the readings before it")
+            waiting = []
+        return f"None for {sum(result is None for result in self.results)} readings"
+
+    @check(OBSERVED, "readings are not changed", "another pass would read other values")
+    def changes_no_reading(self) -> None:
+        _ = self.results
+        copies = [sample.reading for sample in self.reading.copies]
+        require_equal(copies, self.readings, "readings before and after they were observed")
+
+    @check(OBSERVED, "it is deterministic", "a result could not be reproduced")
+    def is_deterministic(self) -> None:
+        expected, front = self.results, self.build()
+        found = [front.observe(reading) for reading in self.readings]
+        require_equal(expected, found, "the results of two front ends with equal settings")
+
+    @check(OBSERVED, "it keeps nothing between passes", "each pass must give the same observations")
+    def separates_passes(self) -> None:
+        expected, first, second = self.results, self.build(), self.build()
+        require(first is not second, "one front end for two passes", "a new one for each pass from `build`")
+        found = []
+        for k, reading in enumerate(self.readings):
+            found.append(first.observe(reading))
+            second.observe(self.readings[k // 2])  # another pass, at another place
+        require_equal(expected, found, "the results of a pass alone and beside another one")
+
+
+def check_touch(name: str, assignments: Sequence[str] = (), source: str | None = None) -> Iterator[Result]:
+    """Checks the touch front end registered under a name.
+
+    Args:
+        assignments: of its settings, each `settings.key=value`; of those of the source `source.key=value`.
+        source: name of the registered source of its readings; None: `Whisk`s of the simulated head.
+
+    Raises:
+        InputError: as `find_parts`.
+    """
+    parts = find_parts(
+        {"settings": (TOUCH, name, "check touch"), "source": (SOURCES, source, "--source")}, assignments
+    )
+    readings = None
+    if source is not None:
+        entry, settings = parts["source"]
+        readings = entry.open(settings or NoSettings(), None)
+    return TouchTrial(*parts["settings"], readings).run_checks()

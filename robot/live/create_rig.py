@@ -60,9 +60,6 @@ MAX_READ_TIME = 1.0
 class CreateRig(PolledRig):
     """The robot and the whiskers of a session; a context manager that leaves the robot at rest.
 
-    Args:
-        config: with a part `create`. stopped: whether the operator has requested the end.
-
     Attributes:
         create: settings of the robot. robot, head: the devices. monitor: strain of the whiskers. alive: [W]
             bool, whiskers with a signal.
@@ -84,11 +81,7 @@ class CreateRig(PolledRig):
         self._free = self.epoch  # newest time at which the bumper was not pressed
 
     def poll(self) -> None:
-        """Reads the samples of the whiskers and the state of the robot.
-
-        Raises:
-            SessionFault, OperatorStop: the session must end.
-        """
+        """Reads the samples of the whiskers and the state of the robot; see `PolledRig`."""
         for frames, arrival in self.stream.take():
             if self.stream.restarts != self._connections:
                 self._connections = self.stream.restarts

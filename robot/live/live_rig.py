@@ -112,9 +112,6 @@ MAX_REST_TIME, REST_TIME = 2.0, 0.3
 class Rig(PolledRig):
     """The two devices of a session; a context manager that leaves both at rest.
 
-    Args:
-        stopped: whether the operator has requested the end.
-
     Attributes:
         arm, head, driver: the devices. odometer: of the arm. state_ages: age of the newest state at each
             poll, s.
@@ -140,11 +137,7 @@ class Rig(PolledRig):
         self._seen = 0
 
     def poll(self) -> None:
-        """Reads the data of both devices.
-
-        Raises:
-            SessionFault, OperatorStop: the session must end.
-        """
+        """Reads the data of both devices; see `PolledRig`."""
         for frames, arrival in self.stream.take():
             if self.recorder is not None:
                 self.recorder.add_frames(frames, arrival - self.epoch)

@@ -142,11 +142,7 @@ def start_and_check(rig: Rig | CreateRig) -> Iterator[str]:
 
 
 def _check_stream(rig: PolledRig) -> None:
-    """Listens to the head for a while and checks rate, damage and clock of its samples.
-
-    Raises:
-        InputError: a check failed; the error gives its cure.
-    """
+    """Listens to the head for a while and checks rate, damage and clock of its samples."""
     head, residual = rig.head, rig.config.residual
     identity = head.identity
     assert identity is not None

@@ -11,8 +11,7 @@ from ratslam.examples import dead_reckoning
 from ratslam.methods.method_registry import BACKENDS
 from ratslam.service.backend_checks import BackendTrial
 from ratslam.service.metric_checks import MetricTrial
-from ratslam.service.source_checks import SourceTrial
-from ratslam.service.touch_checks import TouchTrial
+from ratslam.service.source_checks import SourceTrial, TouchTrial
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.service.touch_checks import TouchTrial
+from ratslam.service.source_checks import TouchTrial
 from robot.simulation.create.simulated_session import CreateSimulation, CreateSimulationConfig
 from robot.touch_source import TouchEntry, report_config_of
 from tactile.base.plugins import NoSettings
