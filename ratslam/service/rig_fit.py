@@ -99,15 +99,10 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
     length, turn, _, true_turn, chord, true_chord = windows
     off = true_turn - values[1] * turn - values[2] * length, true_chord - values[0] * chord
     slips = np.any([np.abs(error) > SLIP * robust_sd(error) for error in off], axis=0)
-    return WheelFit(
-        pairs[0],
-        pairs[1] if turns else None,
-        *pairs[2:],
-        windows=len(length),
-        slips=int(slips.sum()),
-        path=path,
-        turned=turned,
-    )
+    scale, turn_scale, bias, heading_noise, turn_noise, length_noise, position_noise = pairs
+    noises = heading_noise, turn_noise, length_noise, position_noise
+    known = turn_scale if turns else None
+    return WheelFit(scale, known, bias, *noises, len(length), int(slips.sum()), path, turned)
 
 
 def _measure(

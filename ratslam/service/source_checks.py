@@ -329,7 +329,7 @@ def check_source(
         most: samples to examine.
 
     Raises:
-        InputError: as `find_parts`, or the source refuses its settings, for example because a file is missing.
+        InputError: as `find_parts`, or the source refuses its settings, as a file that is missing.
     """
     parts = find_parts(
         {"settings": (SOURCES, name, "check source"), "touch": (TOUCH, touch, "--touch")}, assignments
