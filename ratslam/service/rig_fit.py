@@ -13,6 +13,8 @@ standard deviations over bootstrap copies of blocks of consecutive windows (Kuen
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import reduce
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -219,15 +221,12 @@ class Rig(NamedTuple):
     @classmethod
     def join(cls, rigs: Iterable[Rig]) -> Rig:
         """All parts as one rig."""
-        parts = list(rigs)
-        settings: dict[str, Any] = {}
-        for part in parts:
-            settings = merge_settings(settings, part.settings)
+        quantities, settings, notes, unknown = zip(*rigs, strict=True)
         return cls(
-            tuple(quantity for part in parts for quantity in part.quantities),
-            settings,
-            tuple(note for part in parts for note in part.notes),
-            tuple(reason for part in parts for reason in part.unknown),
+            tuple(chain(*quantities)),
+            reduce(merge_settings, settings, {}),
+            tuple(chain(*notes)),
+            tuple(chain(*unknown)),
         )
 
     def included(self) -> dict[str, Any]:

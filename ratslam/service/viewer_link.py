@@ -49,7 +49,7 @@ class Viewer:
 
     def __init__(self, target: str, end: float = END, command: Sequence[str] | None = None) -> None:
         self.target, self.offered, self.dropped = target, 0, 0
-        self._end, self._warned = end, False
+        self._end = end
         # rerun logs broken connections at length; the process says it in one line.
         environment = os.environ | {"RUST_LOG": "off", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         self._process = subprocess.Popen(

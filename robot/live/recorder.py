@@ -58,11 +58,6 @@ class LiveRecorder:
         self._arrival = self._since = -np.inf  # times of the newest frames and of the oldest pending data
         self._known = np.full(MAX_FRAMES, -1, np.int64)  # sequence numbers of added frames
 
-    @property
-    def count(self) -> int:
-        """Number of readings so far."""
-        return self._tape.count
-
     def add_frames(self, frames: Frames, arrival: float) -> None:
         """Adds frames that arrived at a time, s; frames added before are ignored."""
         with self._writing(arrival) as able:
