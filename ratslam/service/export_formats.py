@@ -110,9 +110,8 @@ def write_nwb(path: Path, recording: CellRecording, spikes: SpikeTrains, digest:
     }
     for name, (data, text) in texts.items():
         shown = module["Position"]["position"]
-        file.add_acquisition(
-            pynwb.TimeSeries(name=name, data=data, timestamps=shown, unit="1", description=text)
-        )
+        series = pynwb.TimeSeries(name=name, data=data, timestamps=shown, unit="1", description=text)
+        file.add_acquisition(series)
     _add_units(file, recording, spikes)
     with pynwb.NWBHDF5IO(path, "w") as output:
         output.write(file)

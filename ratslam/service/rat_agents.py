@@ -105,9 +105,8 @@ def agent_in_box(agent: Any, config: RatSimulationConfig | None = None) -> RatSi
         left, right, bottom, top = np.asarray(agent.Environment.extent, float).tolist()
         if abs(left) > 1e-9 or abs(bottom) > 1e-9:
             cure = "give a configuration and move the environment to the origin"
-            raise InputError(
-                "agent", f"an environment from ({left:g}, {bottom:g}) on", "one from (0, 0)", cure
-            )
+            found = f"an environment from ({left:g}, {bottom:g}) on"
+            raise InputError("agent", found, "one from (0, 0)", cure)
         box = BoxConfig(width=right, height=top)
         config = RatSimulationConfig(box=box, rate_hz=round(1 / agent.dt, 6))
     return RatSimulation(config, path)

@@ -56,9 +56,8 @@ def read_signals_of_reach(source: PluginConfig) -> SignalRecord:
     signal = read_reach(config.file).signal
     block = max(round(DRIFT_BLOCK * config.rate), 1)
     contact = (find_touches(config, signal) == Touch.CONTACT).mean(axis=0)
-    return SignalRecord(
-        signal[: config.free_rows], signal, block, block / config.rate, contact, WHISKERS, "counts"
-    )
+    free, apart = signal[: config.free_rows], block / config.rate
+    return SignalRecord(free, signal, block, apart, contact, WHISKERS, "counts")
 
 
 def _signals_of_cycles(samples: list[Sample]) -> SignalRecord:
@@ -205,9 +204,8 @@ def _from_revisits(config: RunConfig, samples: list[Sample], assumed: OdometryCo
         return Rig(unknown=("wheels: the record has no true poses",))
     scale = "length scale: no true poses, and a map closes its loops at any scale"
     if not any(shows_place(sample.reading) for sample in samples):
-        return Rig(
-            unknown=(scale, "turn scale, heading bias: no true poses, and no views that tell revisits")
-        )
+        reason = "no true poses, and no views that tell revisits"
+        return Rig(unknown=(scale, f"turn scale, heading bias: {reason}"))
     found = fit_revisits(config, assumed)
     if found is None:
         reason = "no true poses, and the map closes no loops or is doubted"

@@ -9,12 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.runs.build_session import open_source
-from ratslam.runs.map_settings import (
-    Sensor,
-    check_same_fov,
-    differing_settings,
-    settings_of_map,
-)
+from ratslam.runs.map_settings import Sensor, check_same_fov, differing_settings, settings_of_map
 from ratslam.runs.saved_map import SavedMap
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
@@ -108,9 +103,8 @@ def _describe_file(path: Path) -> _Found:
         return _describe_bag(path)
     if suffix not in SUFFIXES:
         found = f"no reader for {path.suffix!r} files" if path.suffix else "a file without a suffix"
-        raise InputError(
-            str(path), found, f"one of {', '.join([*SUFFIXES, '.bag', '.db3'])}, or the folder of a bag"
-        )
+        known = ", ".join([*SUFFIXES, ".bag", ".db3"])
+        raise InputError(str(path), found, f"one of {known}, or the folder of a bag")
     if suffix == ".csv":
         return _describe_csv(path)
     if suffix == ".npz":
@@ -153,9 +147,8 @@ def _describe_bag(path: Path) -> _Found:
     for topic in found.topics:
         clock = topic.stamped or topic.received
         roles = ", ".join(topic.roles) or "-"
-        rows.append(
-            (topic.name, topic.kind, str(topic.total), f"{clock.rate_hz:.3g}", _in_words(topic.shape), roles)
-        )
+        total, rate = str(topic.total), f"{clock.rate_hz:.3g}"
+        rows.append((topic.name, topic.kind, total, rate, _in_words(topic.shape), roles))
         if topic.roles:
             notes += _clock_notes(topic.name, clock)
     moving = [f"{parent} -> {child}" for parent, child, fixed, _ in found.links if not fixed]

@@ -158,9 +158,8 @@ class SourceTrial(Trial[SourceEntry]):
         require(sound, f"view_shape {shape!r}", "a tuple of three sizes (R, C, K)")
         require(_is_count(source.whiskers), f"whiskers {source.whiskers!r}", "a number from 0")
         require(length is None or _is_count(length), f"length {length!r}", "a number of samples, or None")
-        require(
-            isinstance(source.digest, str), f"digest {source.digest!r}", "sha256 (hex), '' for a live robot"
-        )
+        sound = isinstance(source.digest, str)
+        require(sound, f"digest {source.digest!r}", "sha256 (hex), '' for a live robot")
         require(isinstance(source.info, SourceInfo), f"info {type(source.info).__name__}", "SourceInfo")
         source.info.to_json()
         return f"view_shape {shape}, {source.whiskers} whiskers"
@@ -176,9 +175,8 @@ class SourceTrial(Trial[SourceEntry]):
 
     @check(OBSERVED, "it closes without hiding errors", "a run that fails would look complete")
     def closes(self) -> None:
-        require(
-            not self.reading.suppresses, "__exit__ returned a true value", "None: errors must get through"
-        )
+        found = "__exit__ returned a true value"
+        require(not self.reading.suppresses, found, "None: errors must get through")
 
     @check(OBSERVED, "times never decrease", "trajectories are matched with truth by time")
     def times_increase(self) -> None:
@@ -189,9 +187,8 @@ class SourceTrial(Trial[SourceEntry]):
         back = np.flatnonzero(np.diff(np.array(times, float)) < 0)
         if len(back):
             k = int(back[0])
-            raise Violation(
-                f"time {times[k + 1]} of sample {k + 1} after {times[k]}", "times that never decrease"
-            )
+            found = f"time {times[k + 1]} of sample {k + 1} after {times[k]}"
+            raise Violation(found, "times that never decrease")
 
     @check(OBSERVED, "observations have the declared shapes", "the kernel is compiled for them")
     def views_have_shapes(self) -> None:
@@ -210,9 +207,8 @@ class SourceTrial(Trial[SourceEntry]):
         for k, sample in enumerate(self.reading.samples):
             if sample.truth is not None:
                 truth, known = sample.truth, known + 1
-                sound = (
-                    isinstance(truth, np.ndarray) and truth.shape == (3,) and bool(np.isfinite(truth).all())
-                )
+                sound = isinstance(truth, np.ndarray) and truth.shape == (3,)
+                sound = sound and bool(np.isfinite(truth).all())
                 require(sound, f"truth {truth!r} of sample {k}", "an array [3] of finite numbers, or None")
         return f"known in {known} of {len(self.reading.samples)} samples"
 
@@ -233,9 +229,8 @@ class SourceTrial(Trial[SourceEntry]):
         found = rate_of(np.array([sample.time for sample in self.reading.samples], float))
         if rate == 0 or found == 0:
             return "not known"
-        require(
-            found / 2 <= rate <= 2 * found, f"rate_hz {rate:g}, but {found:.3g} Hz by the times", "the same"
-        )
+        what = f"rate_hz {rate:g}, but {found:.3g} Hz by the times"
+        require(found / 2 <= rate <= 2 * found, what, "the same")
         return f"{found:.3g} Hz"
 
     @check(OBSERVED, "a sample keeps its values", "a run processes samples in chunks")
@@ -251,9 +246,8 @@ class SourceTrial(Trial[SourceEntry]):
             require(source.length is None, found, "sha256 (hex) of all input of a recording")
             return "a live source"
         again = self.entry.open(self.settings, None).digest
-        require(
-            source.digest == again, f"digest {source.digest} and then {again}", "the same for the same input"
-        )
+        found = f"digest {source.digest} and then {again}"
+        require(source.digest == again, found, "the same for the same input")
         return ""
 
     @check(OBSERVED, "it can be read again", "a result could not be reproduced")
@@ -394,13 +388,11 @@ class TouchTrial(Trial[TouchEntry]):
     def builds(self) -> str:
         front, source = self.first, self.source
         missing = [name for name in ("view_shape", "whiskers", "observe") if not hasattr(front, name)]
-        require(
-            not missing, f"{type(front).__name__} without {', '.join(missing)}", "all of a ReadingProcessor"
-        )
+        found = f"{type(front).__name__} without {', '.join(missing)}"
+        require(not missing, found, "all of a ReadingProcessor")
         shape, whiskers = front.view_shape, front.whiskers
-        counts = (
-            isinstance(shape, tuple) and len(shape) == 3 and all(isinstance(n, int) and n > 0 for n in shape)
-        )
+        counts = isinstance(shape, tuple) and len(shape) == 3
+        counts = counts and all(isinstance(n, int) and n > 0 for n in shape)
         require(counts, f"view_shape {shape!r}", "a tuple of three sizes (R, C, K)")
         found = f"{whiskers} whiskers for those of {source.name}"
         require(whiskers == source.whiskers, found, f"{source.whiskers}, as the source says")

@@ -19,14 +19,7 @@ from robot.drivers.head.reader import HeadReader
 from robot.drivers.head.usb_protocol import to_radians
 from robot.drivers.outcome import SessionOutcome
 from robot.live.live_config import LiveConfig
-from robot.live.polling import (
-    AsyncMapper,
-    OperatorStop,
-    PolledRig,
-    SessionFault,
-    check_mapper,
-    session_fault,
-)
+from robot.live.polling import AsyncMapper, OperatorStop, PolledRig, SessionFault, check_mapper, session_fault
 from robot.simulation.create.state_machine import (
     CreateState,
     MachineState,
@@ -94,9 +87,8 @@ class CreateRig(PolledRig):
         if stop is not None and stop.reason in OUTCOMES:
             detail = stop.detail
             if stop.reason is StopReason.UNPLUGGED:
-                detail += (
-                    f"; a watchdog process waits {self.create.replug:g} s for {self.create.port} to return"
-                )
+                wait, port = self.create.replug, self.create.port
+                detail += f"; a watchdog process waits {wait:g} s for {port} to return"
             raise session_fault(OUTCOMES[stop.reason], detail)
         if fault:
             raise SessionFault(fault)

@@ -165,9 +165,8 @@ def _hand_on(rig: Rig, sequence: _WhiskSequence, number: int, mapper: AsyncMappe
     whole, slow = bool(np.diff(numbers).max() <= gap and even), mapper.behind() > rig.config.budget
     cut = Cut.of(number, stamp, start, frames, odometry, seen=whole and not slow)
     if not cut.seen:
-        rig.record_event(
-            "dropped", f"whisk {number}: " + ("the mapper is behind" if whole else "samples are missing")
-        )
+        reason = "the mapper is behind" if whole else "samples are missing"
+        rig.record_event("dropped", f"whisk {number}: {reason}")
     if rig.recorder is not None:
         rig.recorder.add_whisk(cut, frames, truth)
     mapper.offer(Sample(stamp, assemble_cycle(frames, cut), truth))
