@@ -33,10 +33,8 @@ def main() -> None:
     active = int((history[-1] > 0).sum())
     print(f"after {SHOWN[-1]} steps: {active} of {history[-1].size} active, sd {spread[0]:.2f} cells")
 
-    title = "One activity packet"
-    figure = new_figure(
-        4.9, title, "summed over headings (above) and over x, y (below), from one active cell"
-    )
+    line = "summed over headings (above) and over x, y (below), from one active cell"
+    figure = new_figure(4.9, "One activity packet", line)
     for column, number in enumerate(SHOWN):
         left = 0.62 + 1.85 * column
         plane = add_axes(figure, left, 2.1, 1.6, 1.6)

@@ -41,9 +41,8 @@ def main() -> None:
     line = "classic: {classic:.1g} m off the true path, recall {recall:.1g} m, odometry {odometry:.1g} m"
     print(line.format(**off))
 
-    figure = style.new_figure(
-        5.2, "Places that look alike", "two laps; the yellow stretches have the same views"
-    )
+    line = "two laps; the yellow stretches have the same views"
+    figure = style.new_figure(5.2, "Places that look alike", line)
     for column, (method, color) in enumerate((("classic", style.VERMILLION), ("recall", style.BLUE))):
         axes = style.add_axes(figure, 0.62 + 3.7 * column, 1.0, 3.2, 3.3)
         for stretch in (slice(30, 70), slice(120, 160)):

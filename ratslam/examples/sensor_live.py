@@ -51,9 +51,8 @@ def main() -> None:
     errors = f"{off['online']:.1g} m off, odometry {off['odometry']:.1g} m"
     print(f"{slam.steps} readings mapped as they came: {errors}")
 
-    figure = new_figure(
-        4.9, "Your sensor, live", "four circles in a room, known by six ranges and bad odometry"
-    )
+    line = "four circles in a room, known by six ranges and bad odometry"
+    figure = new_figure(4.9, "Your sensor, live", line)
     plane, clock = add_axes(figure, 0.62, 1.0, 3.0, 3.0), add_axes(figure, 4.6, 1.0, 3.0, 3.0)
     plane.plot(*truth[:, :2].T, color=INK, lw=0.8, label="truth")
     plane.plot(*paths["odometry"][:, :2].T, color=GREY, lw=0.8, ls="--", label="odometry")

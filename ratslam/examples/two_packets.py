@@ -40,9 +40,8 @@ def main() -> None:
     forgotten = "forgotten" if abs(x[WEAK][-1] - PACKET[0]) < 1 else "not forgotten"
     print(f"{WEAK} a step is {forgotten}, {STRONG} a step takes over after {taken} steps")
 
-    figure = new_figure(
-        4.9, "Two packets", "energy is injected at x = 18, y = 4; the network keeps one packet"
-    )
+    line = "energy is injected at x = 18, y = 4; the network keeps one packet"
+    figure = new_figure(4.9, "Two packets", line)
     for column, (number, activity) in enumerate(images):
         axes = add_axes(figure, 0.62 + 2.5 * column, 2.1, 1.9, 1.7)
         axes.imshow(activity, origin="lower", cmap="Blues")

@@ -25,9 +25,8 @@ def main() -> None:
     wall = 2 * gaussian_filter1d(random.random(400), 6)  # brightness every 4 cm
     where = np.tile(np.arange(0, LENGTH, STEP), 2)
     first = (where / 0.04).astype(int)
-    views = np.array([wall[k : k + 6 * PIXELS : 6] for k in first]) + random.normal(
-        0, 0.005, (len(where), PIXELS)
-    )
+    views = np.array([wall[k : k + 6 * PIXELS : 6] for k in first])
+    views += random.normal(0, 0.005, views.shape)
 
     shape = (1, PIXELS, 1)
     match = jax.jit(lambda store, view: view_templates.match_view(CONFIG, shape, store, view))

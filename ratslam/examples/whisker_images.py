@@ -22,9 +22,7 @@ def main() -> None:
         config = ratslam.load_config("whisker_maze", [f"touch.image.transform={transform}"])
         with open_observations(config) as (_, source):
             seen = [observation for _, observation in islice(read_observations(source), WHISKS)]
-        images[transform] = np.array(
-            [observation.view[..., 0] for observation in seen]
-        )  # [whisk, ring, column]
+        images[transform] = np.array([one.view[..., 0] for one in seen])  # [whisk, ring, column]
     touched = (images["contact_angle"] > 0).mean()
     print(f"{WHISKS} whisks of {images['contact_angle'][0].size} whiskers, {touched:.0%} of them in contact")
 
@@ -37,13 +35,8 @@ def main() -> None:
             axes.set(xticks=(), yticks=(), title=f"whisk {whisk + 1}" if row == 0 else "")
             axes.spines[:].set_visible(True)
             name_axes(axes, "", transform.replace("_", "\n") if column == 0 else "")
-    figure.text(
-        0.08,
-        0.06,
-        "rows: rings from the shortest whiskers; columns: from ahead, anticlockwise",
-        color=INK,
-        fontsize=9,
-    )
+    note = "rows: rings from the shortest whiskers; columns: from ahead, anticlockwise"
+    figure.text(0.08, 0.06, note, color=INK, fontsize=9)
     figure.savefig("whisker_images.png")
 
 

@@ -78,10 +78,8 @@ class GoalDrive:
     @property
     def finished(self) -> bool:
         """Whether all goals are reached, or one cannot be."""
-        last = self.goal == len(self.config.to) - 1
-        return self.state in (DriveState.BLOCKED, DriveState.LOST) or (
-            self.state is DriveState.REACHED and last
-        )
+        last = self.state is DriveState.REACHED and self.goal == len(self.config.to) - 1
+        return last or self.state in (DriveState.BLOCKED, DriveState.LOST)
 
     def next_goal(self) -> None:
         """Turns to the next goal; obstacles stay known."""

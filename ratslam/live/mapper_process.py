@@ -253,9 +253,8 @@ def _map(line: Connection) -> None:
         source = open_touch_source(fed, config.touch)  # for its shapes: no sample is read without calibration
         check_finished_map(config, source)
         session = build_session(config, source)
-        blank = observation(
-            Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
-        )
+        still = Odometry(0.0, 0.0, 0.0, 0.0)
+        blank = observation(still, view_shape=source.view_shape, whiskers=source.whiskers)
         session.warm(blank)
         gc.collect()
         gc.freeze()  # what compiling has left need not be searched again: a full collection takes 0.1 s

@@ -150,9 +150,8 @@ def _difference(first: Any, second: Any, path: str = "") -> str:
         parts = [(f"{path}[{key!r}]", first[key], second[key]) for key in first]
     elif isinstance(first, list | tuple) and isinstance(second, list | tuple):
         if type(first) is not type(second) or len(first) != len(second):
-            return (
-                f"{path} {type(first).__name__} of {len(first)} and {type(second).__name__} of {len(second)}"
-            )
+            kinds = (f"{type(one).__name__} of {len(one)}" for one in (first, second))
+            return f"{path} {' and '.join(kinds)}"
         names = [f".{n}" for n in getattr(first, "_fields", ())] or [f"[{k}]" for k in range(len(first))]
         parts = [(path + name, a, b) for name, a, b in zip(names, first, second, strict=True)]
     elif (

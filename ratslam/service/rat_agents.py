@@ -266,9 +266,8 @@ class PoseCellNeurons(Neurons):
         """
         if evaluate_at not in ("agent", "last"):
             cure = "plot_rate_map(method='history') shows the history"
-            raise InputError(
-                "evaluate_at", repr(evaluate_at), "'agent': these cells depend on the path", cure
-            )
+            expected = "'agent': these cells depend on the path"
+            raise InputError("evaluate_at", repr(evaluate_at), expected, cure)
         rates: np.ndarray = self.max_fr / self._peak * self.network.activity[self.cell]
         return rates[:, None]
 

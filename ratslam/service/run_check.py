@@ -126,9 +126,8 @@ def _settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | Non
     if closures is not None and not closures.accepted:
         advice.append(NONE_ACCEPTED if closures.proposed else NONE_PROPOSED)
     elif run.doubt > CAUTION:
-        advice.append(
-            "python -m ratslam report RUN_DIR -o report.html: shows each closure with its two views"
-        )
+        report = "python -m ratslam report RUN_DIR -o report.html"
+        advice.append(f"{report}: shows each closure with its two views")
         if config.recall.sector_fov == "auto":
             advice.append("recall.sector_fov: the sensor's field of view, rad, instead of an estimate")
         advice.append("keyframes.noise: the noise of this robot's odometry, instead of the preset's")

@@ -160,9 +160,8 @@ def prepare_target(text: str) -> str:
             no viewer answers.
     """
     if find_spec("rerun") is None:
-        raise InputError(
-            "--rerun", "rerun is not installed", "the extra 'view'", "pip install 'ratslam[view]'"
-        )
+        cure = "pip install 'ratslam[view]'"
+        raise InputError("--rerun", "rerun is not installed", "the extra 'view'", cure)
     if text.endswith(".rrd"):
         require_new_file(Path(text))
         return os.path.abspath(text)

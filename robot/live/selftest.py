@@ -123,9 +123,8 @@ def start_and_check(rig: Rig | CreateRig) -> Iterator[str]:
         reply = rig.robot.last_reply
         if reply is not None and reply.bumps & Bumps.BUMPED:
             found = f"{reply.bumps.describe()} pressed"
-            raise InputError(
-                "live.create", found, "a free bumper", "move the robot away from what it touches"
-            )
+            cure = "move the robot away from what it touches"
+            raise InputError("live.create", found, "a free bumper", cure)
         yield f"Create: {rig.create.port}, safe mode, at rest, guarded by a watchdog process"
         rig.monitor.begin()
     else:
@@ -152,9 +151,8 @@ def _check_stream(rig: PolledRig) -> None:
     after = head.decoder.counts
     rate = (after.good - before.good) / LISTEN_TIME
     if rate < MIN_RATE_SHARE * identity.rate:
-        raise InputError(
-            "head", f"{rate:.0f} of {identity.rate:g} samples per second", "", "check the USB hub and cable"
-        )
+        found = f"{rate:.0f} of {identity.rate:g} samples per second"
+        raise InputError("head", found, "", "check the USB hub and cable")
     if after.bad > before.bad:
         found = f"{after.bad - before.bad} damaged samples in {LISTEN_TIME:g} s"
         raise InputError("head", found, "none", "change the cable")
@@ -184,6 +182,5 @@ def _check_whiskers(rig: CreateRig) -> str:
     level = 1e6 * float(np.abs(rows - rows.mean(axis=0)).std())
     dead = [str(k) for k in np.flatnonzero(~rig.alive)]
     without = f", without a signal: {', '.join(dead)}" if dead else ""
-    return (
-        f"whiskers: {int(rig.alive.sum())} of {len(rig.alive)} alive, noise {level:.1f} microstrain{without}"
-    )
+    alive = f"{int(rig.alive.sum())} of {len(rig.alive)} alive"
+    return f"whiskers: {alive}, noise {level:.1f} microstrain{without}"
