@@ -14,7 +14,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread
@@ -113,15 +112,17 @@ class Mapper:
         """
         self._outbox.put(message)
         self._asked += 1
-        return partial(self._has_done, self._asked)
+        stages = self._asked
 
-    def _has_done(self, stages: int) -> bool:
-        self.receive()
-        if isinstance(self._failed, InputError):
-            raise self._failed
-        if not self.alive:
-            raise InputError("live", f"the mapper ended: {self.failure}", "")
-        return self._stages >= stages
+        def done() -> bool:
+            self.receive()
+            if isinstance(self._failed, InputError):
+                raise self._failed
+            if not self.alive:
+                raise InputError("live", f"the mapper ended: {self.failure}", "")
+            return self._stages >= stages
+
+        return done
 
     def offer(self, sample: Sample) -> None:
         """Passes the next sample; returns at once."""

@@ -96,7 +96,11 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
     turns = turned >= LEAST_TURNED
     start = _solve_heading(windows, turns)
     windows = _measure(motion, truth, ends, OdometryCorrection(turn_scale=start[0], heading_bias=start[1]))
-    values, draws = _solve(windows, turns), _bootstrap(windows, turns, seed)
+    values, count = _solve(windows, turns), windows.shape[1]
+    blocks = np.array_split(np.arange(count), min(BLOCKS, count))
+    chosen = stream(seed, "fit.wheels").integers(0, len(blocks), (DRAWS, len(blocks)))
+    copies = (np.concatenate([blocks[k] for k in one]) for one in chosen)  # rows of each bootstrap copy
+    draws = np.array([_solve(windows[:, rows], turns) for rows in copies])
     pairs = [(float(value), float(sd)) for value, sd in zip(values, draws.std(axis=0), strict=True)]
     length, turn, _, true_turn, chord, true_chord = windows
     off = true_turn - values[1] * turn - values[2] * length, true_chord - values[0] * chord
@@ -162,15 +166,6 @@ def _solve_robustly(columns: np.ndarray, value: np.ndarray) -> np.ndarray:
         lambda x: columns @ x - value, start, jac=lambda x: columns, loss="soft_l1", f_scale=scale
     )
     return fit.x
-
-
-def _bootstrap(windows: np.ndarray, turns: bool, seed: int) -> np.ndarray:
-    """[DRAWS, 7] fits of copies made of blocks of consecutive windows."""
-    random = stream(seed, "fit.wheels")
-    count = windows.shape[1]
-    blocks = np.array_split(np.arange(count), min(BLOCKS, count))
-    draws = random.integers(0, len(blocks), (DRAWS, len(blocks)))
-    return np.array([_solve(windows[:, np.concatenate([blocks[k] for k in one])], turns) for one in draws])
 
 
 def _clip_slips(error: np.ndarray) -> np.ndarray:
