@@ -170,7 +170,7 @@ def _check(kind: str, arguments: argparse.Namespace) -> int:
 
         results = check_source(name, settings, arguments.touch, arguments.samples or SAMPLES)
     elif kind == "touch":
-        from ratslam.service.touch_checks import check_touch
+        from ratslam.service.source_checks import check_touch
 
         results = check_touch(name, settings, arguments.source)
     else:

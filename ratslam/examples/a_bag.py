@@ -48,12 +48,16 @@ def _write_bag(path: Path) -> None:
     make: Any = {name.split("/")[-1]: kind for name, kind in store.types.items()}
     truth = integrate(np.tile(MOTION, (SAMPLES, 1)))
     odometry = integrate(np.tile(MOTION * [1, 1, 1.05], (SAMPLES, 1)))
+    angle = truth[:, 2:] + RAYS
+    ahead = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    walls = np.where(ahead > 0, ROOM, 0.0) - (truth[:, None, :2] + (ROOM[0] / 2, 0.4))
+    measured = (walls / ahead).min(axis=-1).astype(np.float32)  # [T, 72] ranges to the walls, m
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         names = {"/odom": "PoseStamped", "/truth": "PoseStamped", "/scan": "LaserScan"}
         packages = {"PoseStamped": "geometry_msgs", "LaserScan": "sensor_msgs"}
         kinds = {topic: f"{packages[name]}/msg/{name}" for topic, name in names.items()}
         links = {topic: bag.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
-        for k, ranges in enumerate(_measure(truth)):
+        for k, ranges in enumerate(measured):
             time = 10**9 + k * 10**8  # ns
             header = make["Header"](make["Time"](time // 10**9, time % 10**9), "odom")
             limits = (RAYS[0], RAYS[-1], RAYS[1] - RAYS[0], 0.0, 0.1, 0.1, 9.0)  # angles, times, ranges
@@ -63,15 +67,6 @@ def _write_bag(path: Path) -> None:
                 messages[topic] = make["PoseStamped"](header, make["Pose"](make["Point"](x, y, 0.0), turn))
             for topic, message in messages.items():
                 bag.write(links[topic], time, store.serialize_cdr(message, kinds[topic]))
-
-
-def _measure(poses: np.ndarray) -> np.ndarray:
-    """[T, 72] ranges to the walls, m, float32."""
-    angle = poses[:, 2:] + RAYS
-    ahead = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    walls = np.where(ahead > 0, ROOM, 0.0) - (poses[:, None, :2] + (ROOM[0] / 2, 0.4))
-    ranges: np.ndarray = (walls / ahead).min(axis=-1)
-    return ranges.astype(np.float32)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 import ratslam
 from evaluation.plots.style import BLUE, GREY, VERMILLION, add_axes, add_legend, metre_grid, new_figure
@@ -45,21 +44,17 @@ def main() -> None:
     way = find_way(graph, here, [start])
     off = np.hypot(*(estimate.pose - true)[:2])
     print(f"found after {slam.steps} whisks, {off:.2f} m off; {way.length:.1f} m to the start")
-    _draw(path, slam.trajectory(), way.poses).savefig("come_back.png")
 
-
-def _draw(path: np.ndarray, session: np.ndarray, way: np.ndarray) -> Figure:
-    """The map, where the robot was found, and the way to the start of the map."""
     line = "a robot set down in a saved map finds itself, and the way to its start"
     figure = new_figure(5.0, "Come back", line)
     axes = add_axes(figure, 0.62, 1.0, 6.9, 3.1)
     axes.plot(*path[:, :2].T, color=GREY, lw=1, label="saved map")
-    axes.plot(*session[-1:, :2].T, color=VERMILLION, marker="o", ms=7, ls="", label="found here")
-    axes.plot(*way[:, :2].T, color=BLUE, lw=2, label="way to the start")
+    axes.plot(*slam.trajectory()[-1:, :2].T, color=VERMILLION, marker="o", ms=7, ls="", label="found here")
+    axes.plot(*way.poses[:, :2].T, color=BLUE, lw=2, label="way to the start")
     axes.set_aspect("equal")
     metre_grid(axes)
     add_legend(figure, axes)
-    return figure
+    figure.savefig("come_back.png")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@
 """
 
 import numpy as np
-from matplotlib.figure import Figure
 
 import ratslam
 from evaluation.plots.style import BLUE, GREY, INK, VERMILLION, add_axes, add_legend, metre_grid, new_figure
@@ -29,23 +28,20 @@ def main() -> None:
     paths = {"odometry": integrate(np.array(motion)), "before": before, "after": slam.trajectory()}
     off = {name: np.hypot(*(path[-1] - true[len(path) - 1])[:2]) for name, path in paths.items()}
     print(f"step {slam.steps}: odometry {off['odometry']:.1g} m off, map {off['after']:.1g} m off")
-    _draw(true, paths, slam.map.closures()).savefig("first_loop.png")
 
-
-def _draw(truth: np.ndarray, paths: dict[str, np.ndarray], closures: np.ndarray) -> Figure:
-    """The map before and after the first loop closures, over the true path."""
     figure = new_figure(5.0, "The first loop", "loop closures join the robot's place with its first visit")
     for column, name in enumerate(("before", "after")):
         axes = add_axes(figure, 0.62 + 3.7 * column, 1.0, 3.2, 3.1)
-        axes.plot(*truth[:, :2].T, color=INK, lw=0.8, label="truth")
+        axes.plot(*true[:, :2].T, color=INK, lw=0.8, label="truth")
         axes.plot(*paths["odometry"][:, :2].T, color=GREY, ls="--", lw=1, label="odometry")
         axes.plot(*paths[name][:, :2].T, color=BLUE, lw=1.4, label="map")
         axes.set_aspect("equal")
         metre_grid(axes)
-    lines = np.insert(paths["after"][closures, :2], 2, np.nan, axis=1).reshape(-1, 2)  # separate lines
+    ends = paths["after"][slam.map.closures(), :2]
+    lines = np.insert(ends, 2, np.nan, axis=1).reshape(-1, 2)  # separate lines
     axes.plot(*lines.T, color=VERMILLION, lw=1, marker="o", ms=3, label="loop closure")
     add_legend(figure, axes)
-    return figure
+    figure.savefig("first_loop.png")
 
 
 if __name__ == "__main__":

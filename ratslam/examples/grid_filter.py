@@ -6,7 +6,6 @@
 """
 
 import numpy as np
-from matplotlib.figure import Figure
 
 import ratslam
 from evaluation.plots.style import BLUE, GREEN, GREY, add_axes, add_legend, name_axes, new_figure
@@ -34,16 +33,12 @@ def main() -> None:
     }
     off = {name: np.hypot(*(path - paths["truth"])[:, :2].T).mean() for name, path in paths.items()}
     print(f"after {slam.steps} reports: {off['grid filter']:.1g} m off, odometry {off['odometry']:.1g} m")
-    _draw(maps, paths, config.grid.cell).savefig("grid_filter.png")
 
-
-def _draw(maps: dict[int, np.ndarray], paths: dict[str, np.ndarray], cell: float) -> Figure:
-    """The map as it grows; bright cells are occupied."""
-    line = f"probability of an obstacle in each cell of {100 * cell:g} cm; bright: occupied"
+    line = f"probability of an obstacle in each cell of {100 * config.grid.cell:g} cm; bright: occupied"
     figure = new_figure(4.4, "The grid filter", line)
     for column, (steps, grid) in enumerate(maps.items()):
         axes = add_axes(figure, 0.75 + 2.4 * column, 1.0, 2.25, 2.25)
-        half = len(grid) * cell / 2
+        half = len(grid) * config.grid.cell / 2
         axes.imshow(grid, origin="lower", cmap="inferno", vmin=0, vmax=1, extent=(-half, half, -half, half))
         for (name, path), color in zip(paths.items(), (GREEN, BLUE, GREY), strict=True):
             axes.plot(*path[:steps, :2].T, color=color, lw=0.8, label=name)
@@ -51,7 +46,7 @@ def _draw(maps: dict[int, np.ndarray], paths: dict[str, np.ndarray], cell: float
         name_axes(axes, "x (m)", "y (m)" if column == 0 else "")
         axes.tick_params(labelleft=column == 0)
     add_legend(figure, axes)
-    return figure
+    figure.savefig("grid_filter.png")
 
 
 if __name__ == "__main__":

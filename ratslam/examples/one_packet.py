@@ -8,7 +8,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 from evaluation.plots.style import BLUE, add_axes, name_axes, new_figure
 from ratslam.classic import pose_cells
@@ -33,26 +32,20 @@ def main() -> None:
         cells, (spread, _, _) = step(cells)
     active = int((history[-1] > 0).sum())
     print(f"after {SHOWN[-1]} steps: {active} of {history[-1].size} active, sd {spread[0]:.2f} cells")
-    _draw([history[number] for number in SHOWN]).savefig("one_packet.png")
 
-
-def _draw(activity: list[np.ndarray]) -> Figure:
-    """Activity over x and y above, over the heading below, at the steps shown."""
-    title = "One activity packet"
-    figure = new_figure(
-        4.9, title, "summed over headings (above) and over x, y (below), from one active cell"
-    )
-    for column, (number, cells) in enumerate(zip(SHOWN, activity, strict=True)):
+    line = "summed over headings (above) and over x, y (below), from one active cell"
+    figure = new_figure(4.9, "One activity packet", line)
+    for column, number in enumerate(SHOWN):
         left = 0.62 + 1.85 * column
         plane = add_axes(figure, left, 2.1, 1.6, 1.6)
-        plane.imshow(cells.sum(axis=0), origin="lower", cmap="Blues")
+        plane.imshow(history[number].sum(axis=0), origin="lower", cmap="Blues")
         plane.set_title(f"step {number}", fontsize=10)
         ring = add_axes(figure, left, 0.65, 1.6, 0.9)
-        ring.bar(10 * np.arange(36), cells.sum(axis=(1, 2)), width=9, color=BLUE)
+        ring.bar(10 * np.arange(36), history[number].sum(axis=(1, 2)), width=9, color=BLUE)
         ring.set(ylim=(0, 1), xticks=(0, 180, 350), yticks=())
         name_axes(plane, "x (cells)", "y (cells)" if column == 0 else "")
         name_axes(ring, "heading (deg)", "activity" if column == 0 else "")
-    return figure
+    figure.savefig("one_packet.png")
 
 
 if __name__ == "__main__":

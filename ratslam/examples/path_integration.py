@@ -8,7 +8,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from evaluation.plots.style import BLUE, GREY, INK, add_axes, add_legend, name_axes, new_figure
@@ -41,25 +40,21 @@ def main() -> None:
     unwrapped = around + config.cells_xy * np.round((odometry - around) / config.cells_xy)
     off = np.hypot(*(unwrapped - odometry).T)
     print(f"{FORWARD * STEPS:.3g} m driven, the packet {off.mean():.2g} cells from the odometry in the mean")
-    _draw(odometry, unwrapped, around, config.cells_xy).savefig("path_integration.png")
 
-
-def _draw(odometry: np.ndarray, unwrapped: np.ndarray, around: np.ndarray, size: int) -> Figure:
-    """The path in the plane on the left, the packet on the torus on the right; cells."""
     line = "the square is the torus of 21 x 21 cells: what leaves it on one side returns on the other"
     figure = new_figure(5.0, "Path integration", line)
     plane, torus = add_axes(figure, 0.62, 1.0, 3.2, 3.1), add_axes(figure, 4.5, 1.0, 3.1, 3.1)
     plane.plot(*odometry.T, color=GREY, lw=5, label="odometry")
     plane.plot(*unwrapped.T, color=BLUE, lw=1.2, label="packet, unwrapped")
-    plane.add_patch(Rectangle((0, 0), size, size, fill=False, color=INK, lw=0.8))
+    plane.add_patch(Rectangle((0, 0), config.cells_xy, config.cells_xy, fill=False, color=INK, lw=0.8))
     plane.set_aspect("equal")
     torus.scatter(around[:, 0], around[:, 1], c=np.arange(len(around)), s=6, cmap="Blues", vmin=-80)
-    torus.set(xlim=(0, size), ylim=(0, size), aspect="equal")
+    torus.set(xlim=(0, config.cells_xy), ylim=(0, config.cells_xy), aspect="equal")
     torus.spines[:].set_visible(True)
     for axes in (plane, torus):
         name_axes(axes, "x (cells)", "y (cells)")
     add_legend(figure, plane)
-    return figure
+    figure.savefig("path_integration.png")
 
 
 if __name__ == "__main__":

@@ -6,22 +6,11 @@
 """
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.ndimage import uniform_filter1d
 
 import ratslam
 from evaluation.metrics.trajectory import align
-from evaluation.plots.style import (
-    BLUE,
-    GREY,
-    INK,
-    VERMILLION,
-    YELLOW,
-    add_axes,
-    add_legend,
-    metre_grid,
-    new_figure,
-)
+from evaluation.plots import style
 from tactile.base.se2 import compose, integrate
 
 STEP, LAP, LAPS, PIXELS = 0.15, 200, 2, 12  # m per step, steps per lap, laps, pixels of a view
@@ -51,23 +40,20 @@ def main() -> None:
     }
     line = "classic: {classic:.1g} m off the true path, recall {recall:.1g} m, odometry {odometry:.1g} m"
     print(line.format(**off))
-    _draw(aligned).savefig("places_that_look_alike.png")
 
-
-def _draw(paths: dict[str, np.ndarray]) -> Figure:
-    """The maps of both methods over the true path."""
-    figure = new_figure(5.2, "Places that look alike", "two laps; the yellow stretches have the same views")
-    for column, (method, color) in enumerate((("classic", VERMILLION), ("recall", BLUE))):
-        axes = add_axes(figure, 0.62 + 3.7 * column, 1.0, 3.2, 3.3)
+    line = "two laps; the yellow stretches have the same views"
+    figure = style.new_figure(5.2, "Places that look alike", line)
+    for column, (method, color) in enumerate((("classic", style.VERMILLION), ("recall", style.BLUE))):
+        axes = style.add_axes(figure, 0.62 + 3.7 * column, 1.0, 3.2, 3.3)
         for stretch in (slice(30, 70), slice(120, 160)):
-            axes.plot(*paths["truth"][stretch, :2].T, color=YELLOW, lw=7)
-        axes.plot(*paths["truth"][:, :2].T, color=INK, lw=0.8, label="truth")
-        axes.plot(*paths["odometry"][:, :2].T, color=GREY, lw=1, ls="--", label="odometry")
-        axes.plot(*paths[method][:, :2].T, color=color, lw=1.2, label=method)
+            axes.plot(*aligned["truth"][stretch, :2].T, color=style.YELLOW, lw=7)
+        axes.plot(*aligned["truth"][:, :2].T, color=style.INK, lw=0.8, label="truth")
+        axes.plot(*aligned["odometry"][:, :2].T, color=style.GREY, lw=1, ls="--", label="odometry")
+        axes.plot(*aligned[method][:, :2].T, color=color, lw=1.2, label=method)
         axes.set_aspect("equal")
-        metre_grid(axes)
-    add_legend(figure, axes)
-    return figure
+        style.metre_grid(axes)
+    style.add_legend(figure, axes)
+    figure.savefig("places_that_look_alike.png")
 
 
 if __name__ == "__main__":

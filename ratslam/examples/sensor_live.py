@@ -10,7 +10,6 @@ import threading
 import time
 
 import numpy as np
-from matplotlib.figure import Figure
 
 import ratslam
 from evaluation.plots.style import BLUE, GREY, INK, add_axes, add_legend, metre_grid, name_axes, new_figure
@@ -51,14 +50,9 @@ def main() -> None:
     off = {name: np.hypot(*(path - truth)[:, :2].T).mean() for name, path in paths.items()}
     errors = f"{off['online']:.1g} m off, odometry {off['odometry']:.1g} m"
     print(f"{slam.steps} readings mapped as they came: {errors}")
-    _draw(truth, paths, np.array(seconds)).savefig("sensor_live.png")
 
-
-def _draw(truth: np.ndarray, paths: dict[str, np.ndarray], seconds: np.ndarray) -> Figure:
-    """The poses as they were known during the session, and the time that each step took."""
-    figure = new_figure(
-        4.9, "Your sensor, live", "four circles in a room, known by six ranges and bad odometry"
-    )
+    line = "four circles in a room, known by six ranges and bad odometry"
+    figure = new_figure(4.9, "Your sensor, live", line)
     plane, clock = add_axes(figure, 0.62, 1.0, 3.0, 3.0), add_axes(figure, 4.6, 1.0, 3.0, 3.0)
     plane.plot(*truth[:, :2].T, color=INK, lw=0.8, label="truth")
     plane.plot(*paths["odometry"][:, :2].T, color=GREY, lw=0.8, ls="--", label="odometry")
@@ -70,7 +64,7 @@ def _draw(truth: np.ndarray, paths: dict[str, np.ndarray], seconds: np.ndarray) 
     clock.set_xscale("log")
     name_axes(clock, "time of a step (ms); dotted: between readings", "share of the steps (%)")
     add_legend(figure, plane)
-    return figure
+    figure.savefig("sensor_live.png")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 from evaluation.plots.style import BLUE, GREY, VERMILLION, add_axes, name_axes, new_figure
 from ratslam.classic import pose_cells
@@ -40,26 +39,21 @@ def main() -> None:
     taken = int(np.argmax(x[STRONG] > (PACKET[0] + PLACE[0]) / 2)) + 1
     forgotten = "forgotten" if abs(x[WEAK][-1] - PACKET[0]) < 1 else "not forgotten"
     print(f"{WEAK} a step is {forgotten}, {STRONG} a step takes over after {taken} steps")
-    _draw(x, images).savefig("two_packets.png")
 
-
-def _draw(x: dict[float, np.ndarray], images: list[tuple[int, np.ndarray]]) -> Figure:
-    """Activity over x, y at three steps of the strong injection; decoded x of both."""
-    figure = new_figure(
-        4.9, "Two packets", "energy is injected at x = 18, y = 4; the network keeps one packet"
-    )
+    line = "energy is injected at x = 18, y = 4; the network keeps one packet"
+    figure = new_figure(4.9, "Two packets", line)
     for column, (number, activity) in enumerate(images):
         axes = add_axes(figure, 0.62 + 2.5 * column, 2.1, 1.9, 1.7)
         axes.imshow(activity, origin="lower", cmap="Blues")
         axes.set_title(f"step {number + 1}", fontsize=10)
         name_axes(axes, "x (cells)", "y (cells)" if column == 0 else "")
     trace = add_axes(figure, 0.62, 0.6, 6.9, 1.0)
-    for (energy, decoded), color in zip(x.items(), (GREY, VERMILLION), strict=True):
-        trace.plot(1 + np.arange(STEPS), decoded, color=color, label=f"{energy} a step")
+    for (energy, packet), color in zip(x.items(), (GREY, VERMILLION), strict=True):
+        trace.plot(1 + np.arange(STEPS), packet, color=color, label=f"{energy} a step")
     trace.axhline(PLACE[0], color=BLUE, lw=0.7, ls=":")
     trace.legend(frameon=False, fontsize=8.5)
     name_axes(trace, "step", "decoded x (cells)")
-    return figure
+    figure.savefig("two_packets.png")
 
 
 if __name__ == "__main__":

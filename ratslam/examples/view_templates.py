@@ -8,7 +8,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter1d
 
 from evaluation.plots.style import BLUE, GREY, add_axes, name_axes, new_figure
@@ -26,9 +25,8 @@ def main() -> None:
     wall = 2 * gaussian_filter1d(random.random(400), 6)  # brightness every 4 cm
     where = np.tile(np.arange(0, LENGTH, STEP), 2)
     first = (where / 0.04).astype(int)
-    views = np.array([wall[k : k + 6 * PIXELS : 6] for k in first]) + random.normal(
-        0, 0.005, (len(where), PIXELS)
-    )
+    views = np.array([wall[k : k + 6 * PIXELS : 6] for k in first])
+    views += random.normal(0, 0.005, views.shape)
 
     shape = (1, PIXELS, 1)
     match = jax.jit(lambda store, view: view_templates.match_view(CONFIG, shape, store, view))
@@ -49,21 +47,17 @@ def main() -> None:
         f"first walk: {count} templates stored; second walk: {len(stored_at) - count} stored, "
         f"{right.mean():.0%} of the views recognised at the right place"
     )
-    _draw(views[:half], np.split(template, 2), where[:half]).savefig("view_templates.png")
 
-
-def _draw(views: np.ndarray, templates: list[np.ndarray], where: np.ndarray) -> Figure:
-    """The views of the first walk above, the template of each view of both walks below."""
     figure = new_figure(5.2, "View templates", "a corridor walked twice; views are rows of 24 grey values")
     above, below = add_axes(figure, 0.62, 2.9, 7.0, 1.4), add_axes(figure, 0.62, 0.6, 7.0, 1.9)
-    above.imshow(views.T, aspect="auto", cmap="gray", extent=(0, LENGTH, 0, PIXELS))
+    above.imshow(views[:half].T, aspect="auto", cmap="gray", extent=(0, LENGTH, 0, PIXELS))
     name_axes(above, "", "pixel")
-    below.plot(where, templates[0], color=GREY, lw=6, label="first walk")
-    below.plot(where, templates[1], color=BLUE, lw=1.3, label="second walk")
+    below.plot(where[:half], template[:half], color=GREY, lw=6, label="first walk")
+    below.plot(where[:half], template[half:], color=BLUE, lw=1.3, label="second walk")
     below.set_xlim(0, LENGTH)
     below.legend(frameon=False, fontsize=9)
     name_axes(below, "place (m)", "template")
-    return figure
+    figure.savefig("view_templates.png")
 
 
 if __name__ == "__main__":

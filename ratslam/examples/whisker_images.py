@@ -8,7 +8,6 @@
 from itertools import islice
 
 import numpy as np
-from matplotlib.figure import Figure
 
 import ratslam
 from evaluation.plots.style import INK, add_axes, name_axes, new_figure
@@ -23,16 +22,10 @@ def main() -> None:
         config = ratslam.load_config("whisker_maze", [f"touch.image.transform={transform}"])
         with open_observations(config) as (_, source):
             seen = [observation for _, observation in islice(read_observations(source), WHISKS)]
-        images[transform] = np.array(
-            [observation.view[..., 0] for observation in seen]
-        )  # [whisk, ring, column]
+        images[transform] = np.array([one.view[..., 0] for one in seen])  # [whisk, ring, column]
     touched = (images["contact_angle"] > 0).mean()
     print(f"{WHISKS} whisks of {images['contact_angle'][0].size} whiskers, {touched:.0%} of them in contact")
-    _draw(images).savefig("whisker_images.png")
 
-
-def _draw(images: dict[str, np.ndarray]) -> Figure:
-    """Some images of both transforms."""
     line = "a pixel a whisker: the height of the wall that it touches, dark for tall; white: no contact"
     figure = new_figure(3.2, "Whisker images", line)
     for row, (transform, views) in enumerate(images.items()):
@@ -42,14 +35,9 @@ def _draw(images: dict[str, np.ndarray]) -> Figure:
             axes.set(xticks=(), yticks=(), title=f"whisk {whisk + 1}" if row == 0 else "")
             axes.spines[:].set_visible(True)
             name_axes(axes, "", transform.replace("_", "\n") if column == 0 else "")
-    figure.text(
-        0.08,
-        0.06,
-        "rows: rings from the shortest whiskers; columns: from ahead, anticlockwise",
-        color=INK,
-        fontsize=9,
-    )
-    return figure
+    note = "rows: rings from the shortest whiskers; columns: from ahead, anticlockwise"
+    figure.text(0.08, 0.06, note, color=INK, fontsize=9)
+    figure.savefig("whisker_images.png")
 
 
 if __name__ == "__main__":

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from evaluation.metrics.trajectory import read_tum
+from ratslam.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from ratslam.live.goal_planner import GoalPlanner, contact_map
-from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status, quantiles
+from ratslam.live.live_robot import LiveRobot, mapped_config, mapper_status, quantiles
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.localise import localising
 from ratslam.runs.saved_map import read_map
@@ -22,18 +23,14 @@ from robot.drivers.outcome import SessionOutcome
 from robot.live.arm_route import (
     ArmRoute,
     MovableArm,
-    approach_route,
+    arm_routes,
     check_targets,
-    descent_route,
-    main_route,
     plan_path,
     plan_scene,
     whole_path,
 )
-from robot.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from robot.live.live_rig import Rig
 from robot.live.polling import SessionFault, session_fault
-from robot.live.selftest import find_devices, start_and_check
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
 from robot.sources.source import SourceInfo
 from robot.world.maze import POSE_CELL_SIZE
@@ -67,10 +64,9 @@ def plan_goals(config: RunConfig) -> tuple[RunConfig, GoalRoute]:
         config = config.model_copy(update={"live": live})
     made = saved.open_session().map
     planner = GoalPlanner(made.graph(), goal, live.plan.motion)
-    drive = GoalDrive(goal, planner, saved.config.pose_cells.cell_size, len(goal.to))
+    drive = GoalDrive(goal, planner, saved.config.pose_cells.cell_size)
     contacts = contact_map(made, config.touch.image, ur10_head(config.touch.head))
-    route = GoalRoute(drive, live, drive.off_way, goal.coast, contacts)
-    return localising(config, saved, goal.start), route
+    return localising(config, saved, goal.start), GoalRoute(drive, live, contacts)
 
 
 class GoalSteering:
@@ -146,8 +142,8 @@ def prepare_arm_session(config: RunConfig, directory: Path) -> Callable[[Callabl
     return lambda stopped: ArmSession(config, path, directory, stopped, goals)
 
 
-class ArmSession:
-    """The arm's part of a session (`ratslam.live.live_robot.LiveRobot`).
+class ArmSession(LiveRobot):
+    """The arm's part of a session.
 
     Args:
         path: the route. stopped: whether the operator has requested the end. goals: the route to goals, if
@@ -155,6 +151,7 @@ class ArmSession:
     """
 
     unit = "whisk"
+    rig: Rig
 
     def __init__(
         self,
@@ -165,12 +162,30 @@ class ArmSession:
         goals: GoalRoute | None = None,
     ) -> None:
         assert config.live is not None
-        self._config, self._path = config, path
+        self._config = config
+        self._approach, self._descent, self._route = arm_routes(config.live, path)
         self.rig = Rig(config.live, config.touch.head, stopped)
-        self.job = _mapping_job(config, directory)
-        self.total = config.live.whisks or (
-            None if goals else ceil(path.duration * config.live.plan.whisking.rate)
+        live, plan, head = config.live, config.live.plan, ur10_head(config.touch.head)
+        whole, rate = whole_path(live, head), plan.whisking.rate
+        rows = ceil(1.5 * whole.duration * rate) if live.whisks is None else live.whisks
+        maze = None if live.waypoints else maze_info(plan_scene(plan, head).maze, plan.maze, plan.seed)
+        provenance = {"live": live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})}
+        self.job = MappingJob(
+            mapped_config(config, directory, rows),
+            SourceInfo(
+                raw_whiskers=True,
+                cell_size=POSE_CELL_SIZE,
+                head=config.touch.head,
+                maze=maze,
+                provenance=provenance,
+            ),
+            directory,
+            view_shape(config.touch.image, head),
+            len(head.length),
+            rate,
+            float(np.abs(whole.pose[:, :2] - whole.pose[0, :2]).max()),
         )
+        self.total = live.whisks or (None if goals else ceil(path.duration * rate))
         self._goals = goals
         self._steering: GoalSteering | None = None
         self._whisks: list[WhiskReport] = []
@@ -182,33 +197,36 @@ class ArmSession:
         steered = self._steering is not None and self._steering.route.drive.finished
         return SessionOutcome.REACHED if steered else SessionOutcome.COMPLETE
 
-    @property
-    def count(self) -> int:
-        return len(self._whisks)
+    def calibrate(self, log: Callable[[str], None]) -> Calibration:
+        """Records free whisks above the start of the route."""
+        rig, plan = self.rig, self.rig.config.plan
+        log("arm: moving above the start of the route")
+        follow_route(rig, self._approach)
+        count = ceil(plan.calibration.min_duration * plan.whisking.rate)
+        log(f"head: {count} whisks in free air")
+        rig.driver.whisk(plan.whisking.model_copy(update={"mode": "open"}))
+        record = record_free_whisks(rig, count)
+        window = self._config.touch.contact.slope_window
+        return calibrate(plan.calibration, record, window, "free whisking")
 
-    def prepare(self, mapper: Mapper, log: Callable[[str], None]) -> Calibration:
-        """Tests both devices, calibrates in free air above the start, lowers the head and starts whisking."""
-        rig = self.rig
-        for line in find_devices(rig):
-            log(line)
-        compile_mapper(rig, mapper, self.job, log)
-        calibration = _calibrate(rig, self._config, self._path, log)
-        begin_mapping(rig, mapper, calibration)
-        follow_route(rig, descent_route(rig.config, self._path))
-        whisking = rig.config.plan.whisking
-        rig.driver.whisk(whisking, calibration.threshold[:, 1], calibration.mean[:, 1])
-        return calibration
+    def lower(self, calibration: Calibration | None) -> None:
+        """Lowers the head and starts whisking."""
+        assert calibration is not None
+        follow_route(self.rig, self._descent)
+        whisking = self.rig.config.plan.whisking
+        self.rig.driver.whisk(whisking, calibration.threshold[:, 1], calibration.mean[:, 1])
 
     def run(self, mapper: Mapper, tell: Callable[[str], None]) -> None:
         def count(whisk: WhiskReport) -> None:
             self._whisks.append(whisk)
+            self.count += 1
             self._dropped, self._lost = self._dropped + (not whisk.seen), self._lost + whisk.missing
             late = f"late {1e3 * whisk.lateness:.0f} ms"
             lost = f"{self._lost} samples lost, {self._dropped} images dropped"
             steering = self._steering.status() if self._steering else ""
             tell(f"{mapper_status(mapper)}{steering}{late}, {lost}")
 
-        route: ArmRoute = main_route(self.rig.config, self._path)
+        route: ArmRoute = self._route
         if self._goals is not None:
             route = self._steering = GoalSteering(self._goals, self.rig, mapper, self._whisks)
         run_whisk_loop(self.rig, route, mapper, count)
@@ -223,46 +241,4 @@ class ArmSession:
             **({} if self._steering is None else {"goals": self._steering.ends}),
             "lateness_s": quantiles([whisk.lateness for whisk in self._whisks]),
             "state_age_s": quantiles(self.rig.state_ages),
-            "head": self.rig.head.decoder.counts._asdict() | {"stalls": self.rig.head.stalls},
         }
-
-
-def _mapping_job(config: RunConfig, directory: Path) -> MappingJob:
-    """The job of the mapper, with the description of the robot for the recording."""
-    assert config.live is not None
-    head = ur10_head(config.touch.head)
-    plan = config.live.plan
-    path = whole_path(config.live, head)
-    rate = plan.whisking.rate
-    rows = ceil(1.5 * path.duration * rate) if config.live.whisks is None else config.live.whisks
-    return MappingJob(
-        mapped_config(config, directory, rows),
-        SourceInfo(
-            raw_whiskers=True,
-            cell_size=POSE_CELL_SIZE,
-            head=config.touch.head,
-            maze=None
-            if config.live.waypoints
-            else maze_info(plan_scene(plan, head).maze, plan.maze, plan.seed),
-            provenance={"live": config.live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})},
-        ),
-        directory,
-        view_shape(config.touch.image, head),
-        len(head.length),
-        rate,
-        float(np.abs(path.pose[:, :2] - path.pose[0, :2]).max()),
-    )
-
-
-def _calibrate(rig: Rig, config: RunConfig, path: HeadPath, log: Callable[[str], None]) -> Calibration:
-    """Tests both devices, and records free whisks above the start of the route for the calibration."""
-    plan = rig.config.plan
-    for line in start_and_check(rig):
-        log(line)
-    log("arm: moving above the start of the route")
-    follow_route(rig, approach_route(rig.config, path))
-    count = ceil(plan.calibration.min_duration * plan.whisking.rate)
-    log(f"head: {count} whisks in free air")
-    rig.driver.whisk(plan.whisking.model_copy(update={"mode": "open"}))
-    record = record_free_whisks(rig, count)
-    return calibrate(plan.calibration, record, config.touch.contact.slope_window, "free whisking")

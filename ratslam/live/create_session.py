@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.live.live_robot import begin_mapping, compile_mapper, mapped_config, mapper_status
+from ratslam.live.live_robot import LiveRobot, mapped_config, mapper_status
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
-from robot.drivers.outcome import SessionOutcome
 from robot.live.create_rig import CreateRig, run_create_loop
-from robot.live.selftest import find_devices, start_and_check
-from robot.simulation.create.simulated_session import CreateSimulationConfig, describe_create
+from robot.simulation.create.simulated_session import describe_create
 from robot.simulation.create.state_machine import CreateState
 from robot.world.arena import make_arena, wall_segments
 from tactile.base.errors import InputError
@@ -41,42 +39,41 @@ def prepare_create_session(
     return lambda stopped: CreateSession(config, directory, stopped)
 
 
-class CreateSession:
-    """The Create's part of a session (`ratslam.live.live_robot.LiveRobot`).
+class CreateSession(LiveRobot):
+    """The Create's part of a session."""
 
-    Args:
-        stopped: whether the operator has requested the end.
-    """
-
-    end = SessionOutcome.COMPLETE
     unit = "report"
+    rig: CreateRig
 
     def __init__(self, config: RunConfig, directory: Path, stopped: Callable[[], bool]) -> None:
         assert config.live is not None
         assert config.live.create is not None
         self.rig = CreateRig(config.live, stopped)
         plan = config.live.create.plan
-        self.job = _mapping_job(config, plan, directory)
+        arena = make_arena(plan.arena, plan.seed)
+        info = describe_create(plan, arena)
+        live = config.live.model_dump(mode="json", exclude={"create": {"plan": {"arena": {"file"}}}})
+        whiskers = len(plan.whiskers.mounts)
+        # Largest distance of a wall from the start along the robot's first x or y axis, m.
+        x, y, heading = arena.start
+        offset = wall_segments(arena).reshape(-1, 2) - [x, y]
+        c, s = np.cos(heading), np.sin(heading)
+        ahead, left = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
+        self.job = MappingJob(
+            mapped_config(config, directory, plan.reports or ceil(60 * plan.minutes / SHORTEST_STEP)),
+            info.model_copy(update={"provenance": {**info.provenance, "live": live}}),
+            directory,
+            (1, whiskers, 1),
+            whiskers,
+            1 / plan.behaviour.step,
+            float(np.abs([ahead, left]).max()),
+        )
         self.total = plan.reports
-        self._count = 0
         self._ends: Counter[StepEnd] = Counter()
-
-    @property
-    def count(self) -> int:
-        return self._count
-
-    def prepare(self, mapper: Mapper, log: Callable[[str], None]) -> None:
-        """Finds and tests the devices; nothing moves."""
-        for line in find_devices(self.rig):
-            log(line)
-        compile_mapper(self.rig, mapper, self.job, log)
-        for line in start_and_check(self.rig):
-            log(line)
-        begin_mapping(self.rig, mapper, None)
 
     def run(self, mapper: Mapper, tell: Callable[[str], None]) -> None:
         def count(time: float, state: CreateState, moment: StepEnd) -> None:
-            self._count += 1
+            self.count += 1
             self._ends[moment] += 1
             ends = ", ".join(f"{self._ends[end]} {end.name}" for end in StepEnd if end is not StepEnd.FREE)
             tell(f"{mapper_status(mapper)}{time:.0f} s, {state.name}, {ends}")
@@ -88,28 +85,4 @@ class CreateSession:
             "ends": {end.name.lower(): self._ends[end] for end in StepEnd},
             "alive": self.rig.alive.tolist(),
             "serial": self.rig.robot.counts._asdict(),
-            "head": self.rig.head.decoder.counts._asdict() | {"stalls": self.rig.head.stalls},
         }
-
-
-def _mapping_job(config: RunConfig, plan: CreateSimulationConfig, directory: Path) -> MappingJob:
-    """The job of the mapper, with the description of the robot for the recording."""
-    assert config.live is not None
-    arena = make_arena(plan.arena, plan.seed)
-    info = describe_create(plan, arena)
-    live = config.live.model_dump(mode="json", exclude={"create": {"plan": {"arena": {"file"}}}})
-    whiskers = len(plan.whiskers.mounts)
-    # Largest distance of a wall from the start along the robot's first x or y axis, m.
-    x, y, heading = arena.start
-    offset = wall_segments(arena).reshape(-1, 2) - [x, y]
-    c, s = np.cos(heading), np.sin(heading)
-    ahead, left = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
-    return MappingJob(
-        mapped_config(config, directory, plan.reports or ceil(60 * plan.minutes / SHORTEST_STEP)),
-        info.model_copy(update={"provenance": {**info.provenance, "live": live}}),
-        directory,
-        (1, whiskers, 1),
-        whiskers,
-        1 / plan.behaviour.step,
-        float(np.abs([ahead, left]).max()),
-    )

@@ -1,4 +1,4 @@
-"""Ways on a saved map: to the goals of a drive (`robot.live.goal_drive`), and between two places, drawn."""
+"""Ways on a saved map: to the goals of a drive (`ratslam.live.goal_drive`), and between two places, drawn."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from ratslam.mapping.map import KeyframeMap
 from ratslam.places.contact_alignment import RememberedContacts, placed_points
 from ratslam.places.route import (
     Mode,
-    NoWay,
     Travel,
     Way,
     experiences_near,
@@ -26,7 +25,6 @@ from ratslam.places.route import (
 )
 from ratslam.recall.whisker_likelihood import level_heights
 from ratslam.runs.saved_map import SavedMap
-from robot.live.goal_drive import RECENT, ContactMap, DriveState, NoContacts, PlannedWay
 from robot.live.live_config import GoalConfig
 from robot.world.scene import MotionConfig
 from tactile.base.errors import InputError
@@ -38,13 +36,14 @@ from tactile.whisker_image import ImageConfig
 if TYPE_CHECKING:
     import networkx
 
-
+RECENT = 8
+"""Whisks whose contacts are aligned with those of the map."""
 HEADING_RADIUS = 0.2
 """Distance that a difference in heading of 1 rad counts for in the search for the nearest experience, m."""
 
 
 class GoalPlanner:
-    """Ways over the experiences of a map; a `robot.live.goal_drive.Planner`.
+    """Ways over the experiences of a map, which were driven.
 
     Args:
         experiences: graph of the map, see `KeyframeMap.graph`. motion: of the robot.
@@ -65,25 +64,25 @@ class GoalPlanner:
             for k, goal in enumerate(config.to)
         ]
 
-    def plan(self, pose: np.ndarray, goal: int, obstacles: np.ndarray) -> PlannedWay:
-        """See `robot.live.goal_drive.Planner`."""
+    def plan(self, pose: np.ndarray, goal: int, obstacles: np.ndarray) -> np.ndarray | None:
+        """Poses [K, 3] of the way from a pose [3] to a goal (its number in the list), clear of obstacles
+        [n, 2] m; None: the pose is away from driven ground.
+
+        Raises:
+            NoWay: there is none.
+        """
         config = self._config
         graph = travel_graph(self._experiences, self._travel, obstacles, config.standoff)
         start = nearest_experience(graph, pose, config.farthest, HEADING_RADIUS)
         if start is None:
-            reason = f"no experience within {config.farthest:g} m of the estimate"
-            return PlannedWay(None, DriveState.LOST, reason)
-        try:
-            goals = experiences_near(graph, self.goals[goal], config.tolerance)
-            return PlannedWay(find_way(graph, start, goals, config.mode).poses)
-        except NoWay as error:
-            return PlannedWay(None, DriveState.BLOCKED, str(error))
+            return None
+        goals = experiences_near(graph, self.goals[goal], config.tolerance)
+        return find_way(graph, start, goals, config.mode).poses
 
 
-def contact_map(made: Map, image: ImageConfig, head: Head) -> ContactMap:
+def contact_map(made: Map, image: ImageConfig, head: Head) -> RememberedContacts:
     """The contacts of the keyframes of a map; those of none if it has no whisker images of this head."""
-    found = _keyframe_contacts(made, image, head)
-    return RememberedContacts(*found, RECENT) if len(found[1]) else NoContacts()
+    return RememberedContacts(*_keyframe_contacts(made, image, head), RECENT)
 
 
 def _keyframe_contacts(made: Map, image: ImageConfig, head: Head) -> tuple[np.ndarray, list[np.ndarray]]:

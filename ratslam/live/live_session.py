@@ -16,16 +16,21 @@ from evaluation.metrics.scorecard import Scorecard
 from ratslam.live.arm_session import prepare_arm_session
 from ratslam.live.create_session import prepare_create_session
 from ratslam.live.live_robot import RECORDING, LiveRobot, quantiles
-from ratslam.live.mapper_process import Mapper, MappingJob
+from ratslam.live.mapper_process import Mapper
 from ratslam.runs.run import catch_interrupt
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.processes import urgent
 from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
-from robot.live.selftest import check_disk
+from robot.live.selftest import check_disk, find_devices, start_and_check
+from robot.recordings.mcap_writer import Recorder
+from robot.sources.source import SourceDescription
 from tactile.base.files import require_new_file
 from tactile.calibration import Calibration
+
+START_TIMEOUT = 300.0
+"""Time limit of the mapper's start, with compilation, s."""
 
 
 def run_live_session(
@@ -56,36 +61,43 @@ def run_live_session(
     require_new_file(directory, parents=True)
     open_robot = choose(config, directory)
     log(check_disk(config.live, directory))
-    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping, view) as mapper:
+    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping) as mapper:
         robot = open_robot(stopped)
+        robot.job = robot.job._replace(view=view)
         fault, standing, card = None, False, None
         try:
             with robot.rig as rig:
                 try:
-                    calibration = robot.prepare(mapper, log)
+                    calibration = _prepare(robot, mapper, log)
                     log("armed")
                     armed(directory)
-                    with open_recorder(robot.job, calibration) as rig.recorder:
+                    job = robot.job
+                    info = job.info.model_copy(update={"calibration": calibration})
+                    source = SourceDescription(job.view_shape, job.whiskers, job.rate_hz, info)
+                    with LiveRecorder(Recorder(job.directory / RECORDING, source)) as rig.recorder:
                         _run(robot, mapper)
                     fault = Fault(robot.end, f"{robot.count} {robot.unit}s", time.monotonic())
                 except SessionFault as error:
                     fault = error.fault
-                except OperatorStop:
-                    fault = _interruption(robot)
-                except KeyboardInterrupt:  # a second one
-                    fault = _interruption(robot)
-                    raise
+                except (OperatorStop, KeyboardInterrupt) as error:
+                    done = f"after {robot.count} {robot.unit}s, which `run` on the recording maps"
+                    detail = done if robot.count else "nothing was recorded"
+                    fault = Fault(SessionOutcome.INTERRUPTED, detail, time.monotonic())
+                    if isinstance(error, KeyboardInterrupt):  # a second one
+                        raise
                 standing = rig.rest()
             if robot.count:
                 card = mapper.finish(not fault.outcome.planned)
         finally:
             if fault is not None:
+                head = robot.rig.head
                 report = {
                     "outcome": fault.outcome.name.lower(),
                     "detail": fault.detail,
                     "standing": standing,
                     f"{robot.unit}s": robot.count,
                     **robot.report(),
+                    "head": head.decoder.counts._asdict() | {"stalls": head.stalls},
                     "mapper_s": quantiles([result.seconds for result in mapper.mapped]),
                 }
                 text = json.dumps(report, indent=2) + "\n"
@@ -94,21 +106,19 @@ def run_live_session(
     return fault, card
 
 
-def _interruption(robot: LiveRobot) -> Fault:
-    done = f"after {robot.count} {robot.unit}s, which `run` on the recording maps"
-    detail = done if robot.count else "nothing was recorded"
-    return Fault(SessionOutcome.INTERRUPTED, detail, time.monotonic())
-
-
-def open_recorder(job: MappingJob, calibration: Calibration | None) -> LiveRecorder:
-    """The recorder of the session."""
-    return LiveRecorder(
-        job.directory / RECORDING,
-        view_shape=job.view_shape,
-        whiskers=job.whiskers,
-        rate_hz=job.rate_hz,
-        info=job.info.model_copy(update={"calibration": calibration}),
-    )
+def _prepare(robot: LiveRobot, mapper: Mapper, log: Callable[[str], None]) -> Calibration | None:
+    """Finds, tests and calibrates the devices, while the mapper compiles and makes its run directory."""
+    rig, late = robot.rig, SessionOutcome.MAPPER_GONE
+    for line in find_devices(rig):
+        log(line)
+    log("mapper: compiling")
+    rig.wait_until(mapper.prepare(robot.job), START_TIMEOUT, late, "compiling")
+    for line in start_and_check(rig):
+        log(line)
+    calibration = robot.calibrate(log)
+    rig.wait_until(mapper.prepare(calibration), START_TIMEOUT, late, "the mapper's start")
+    robot.lower(calibration)
+    return calibration
 
 
 def _run(robot: LiveRobot, mapper: Mapper) -> None:

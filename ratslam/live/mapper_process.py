@@ -12,7 +12,7 @@ import os
 import queue
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -24,14 +24,13 @@ import numpy as np
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.processes import step_back, withheld_signals
-from robot.sources.source import Sample, SourceInfo
+from robot.sources.source import ClosedSource, Sample, SourceInfo
 from tactile.base.errors import InputError
 from tactile.calibration import Calibration
 from tactile.whisker_geometry import ur10_head
 
 LOG = "mapper.log"
 """Log of the mapper process, in the run directory."""
-NO_POINTS = np.zeros((0, 2))
 FINISH_TIMEOUT = 120.0
 """Time limit of scoring and plotting, s."""
 
@@ -62,32 +61,31 @@ class MappedSample(NamedTuple):
 
     Attributes:
         number: of the sample; a front end may add the motion of one to the next, which then has no result.
-            pose: [3] online, in the map frame (m, m, rad). place: -1 for none. action: by
-            name. seconds: computing time. doubt: see `ratslam.core.session.Step`. lost: whether
-            the method has lost track of the position. points: [n, 2] contacts in base_link, m.
+            pose: [3] online, in the map frame (m, m, rad). place: -1 for none. seconds: computing time.
+            doubt: see `ratslam.core.session.Step`. lost: whether the method has lost track of the position.
+            points: [n, 2] contacts in base_link, m.
     """
 
     number: int
     pose: np.ndarray
     place: int
-    action: str
     seconds: float
-    doubt: float = np.nan
-    lost: bool = False
-    points: np.ndarray = NO_POINTS
+    doubt: float
+    lost: bool
+    points: np.ndarray
 
 
 class Mapper:
     """Handle of the mapper process; a context manager. The process starts at once, to be ready early.
 
     Args:
-        process: its main function; None: `run_mapper`. view: target of a live view, or None.
+        process: its main function; None: `run_mapper`.
 
     Attributes:
         mapped: results of all samples mapped so far, in order.
     """
 
-    def __init__(self, process: Any = None, view: str | None = None) -> None:
+    def __init__(self, process: Any = None) -> None:
         context = multiprocessing.get_context("spawn")
         self._line, theirs = context.Pipe()
         target = process or run_mapper
@@ -96,35 +94,35 @@ class Mapper:
             self._process.start()
         theirs.close()
         self.mapped: list[MappedSample] = []
-        self._view = view
-        self._stages, self._failed = 0, ""
-        self._refusal: InputError | None = None
+        self._asked = self._stages = 0
+        self._failed: InputError | str = ""  # a refusal of the job, or an error
         self._card: Scorecard | None = None
         self._offered: list[float] = []
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._sender = Thread(target=self._send, daemon=True, name="to mapper")
         self._sender.start()
 
-    def compile(self, job: MappingJob) -> None:
-        """Sends the job, for which the process compiles. Returns at once; see `compiled`."""
-        self._outbox.put(job._replace(view=self._view))
+    def prepare(self, message: MappingJob | Calibration | None) -> Callable[[], bool]:
+        """Sends the job, for which the process compiles, and the next time the head's calibration (None
+        without one): the process then makes its run directory and is ready for samples.
 
-    def begin(self, calibration: Calibration | None) -> None:
-        """Sends the head's calibration, if it has one: the process makes its directory. Returns at once; see
-        `ready`."""
-        self._outbox.put(calibration)
-
-    def compiled(self) -> bool:
-        """Whether the mapper has compiled.
-
-        Raises:
-            InputError: the job was refused, or the process has ended.
+        Returns:
+            at once, a function that says whether the process has done so; it raises `InputError` if the job
+            was refused, or the process has ended.
         """
-        return self._completed_stages() >= 1
+        self._outbox.put(message)
+        self._asked += 1
+        stages = self._asked
 
-    def ready(self) -> bool:
-        """Whether the mapper is ready for samples; errors as of `compiled`."""
-        return self._completed_stages() >= 2
+        def done() -> bool:
+            self.receive()
+            if isinstance(self._failed, InputError):
+                raise self._failed
+            if not self.alive:
+                raise InputError("live", f"the mapper ended: {self.failure}", "")
+            return self._stages >= stages
+
+        return done
 
     def offer(self, sample: Sample) -> None:
         """Passes the next sample; returns at once."""
@@ -146,24 +144,22 @@ class Mapper:
                     self.mapped.append(message)
                 elif isinstance(message, Scorecard):
                     self._card = message
-                elif isinstance(message, InputError):
-                    self._refusal = message
                 elif message is True:
                     self._stages += 1
                 else:
-                    self._failed = str(message)
+                    self._failed = message
         except (EOFError, OSError):
             self._failed = self._failed or "its connection broke"
 
     @property
     def alive(self) -> bool:
         """Whether the process runs and has reported no failure."""
-        return self._process.is_alive() and not self._failed and self._refusal is None
+        return self._process.is_alive() and not self._failed
 
     @property
     def failure(self) -> str:
         """Reason for the end of the mapper, as far as known."""
-        return self._failed or str(self._refusal or f"it ended with code {self._process.exitcode}")
+        return str(self._failed or f"it ended with code {self._process.exitcode}")
 
     def finish(self, interrupted: bool) -> Scorecard | None:
         """Waits for the score; None if the process has ended or mapped nothing.
@@ -177,14 +173,6 @@ class Mapper:
             self._line.poll(0.05)
             self.receive()
         return self._card
-
-    def _completed_stages(self) -> int:
-        self.receive()
-        if self._refusal is not None:
-            raise self._refusal
-        if not self.alive:
-            raise InputError("live", f"the mapper ended: {self.failure}", "")
-        return self._stages
 
     def _send(self) -> None:
         while True:
@@ -207,7 +195,7 @@ class Mapper:
         self._line.close()
 
 
-class PipeSource:
+class PipeSource(ClosedSource):
     """The samples received through a pipe, as a source.
 
     Attributes:
@@ -224,14 +212,6 @@ class PipeSource:
         self.received, self.count = 0.0, 0
         self._line = line
 
-    def calibrate(self) -> None:
-        """Waits for the head's calibration and adds it to the information.
-
-        Raises:
-            EOFError: the parent has ended.
-        """
-        self.info = self.info.model_copy(update={"calibration": self._line.recv()})
-
     def __iter__(self) -> Iterator[Sample]:
         while True:
             try:
@@ -243,12 +223,6 @@ class PipeSource:
                 return
             self.received, self.count = time.monotonic(), self.count + 1
             yield message
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
 
 
 def run_mapper(line: Connection) -> None:
@@ -266,7 +240,6 @@ def run_mapper(line: Connection) -> None:
 
 
 def _map(line: Connection) -> None:
-    from ratslam.core.estimates import Action
     from ratslam.live.goal_planner import felt_points
     from ratslam.runs.build_session import build_session
     from ratslam.runs.runner import check_finished_map, open_runner
@@ -281,14 +254,13 @@ def _map(line: Connection) -> None:
         source = open_touch_source(fed, config.touch)  # for its shapes: no sample is read without calibration
         check_finished_map(config, source)
         session = build_session(config, source)
-        blank = observation(
-            Odometry(0.0, 0.0, 0.0, 0.0), view_shape=source.view_shape, whiskers=source.whiskers
-        )
+        still = Odometry(0.0, 0.0, 0.0, 0.0)
+        blank = observation(still, view_shape=source.view_shape, whiskers=source.whiskers)
         session.warm(blank)
         gc.collect()
         gc.freeze()  # what compiling has left need not be searched again: a full collection takes 0.1 s
         line.send(True)
-        fed.calibrate()
+        fed.info = fed.info.model_copy(update={"calibration": line.recv()})  # EOFError: the parent has ended
         source = open_touch_source(fed, config.touch)
         with open_runner(config, source, job.directory, session=session, observers=observers) as runner:
             # Sends the output of the process, including tracebacks, to a file: the terminal is the parent's.
@@ -302,8 +274,8 @@ def _map(line: Connection) -> None:
                 estimate, touch = step.estimate, config.touch
                 points = felt_points(sample.reading, touch.image, ur10_head(touch.head))
                 result = MappedSample(
-                    fed.count - 1, np.asarray(step.pose), int(estimate.place),
-                    Action(int(estimate.action)).name.lower(), took, step.doubt, bool(estimate.lost), points,
+                    fed.count - 1, np.asarray(step.pose), int(estimate.place), took, step.doubt,
+                    bool(estimate.lost), points,
                 )  # fmt: skip
                 _send(line, result)
             if runner.session.steps:

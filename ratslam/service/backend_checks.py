@@ -27,15 +27,13 @@ from ratslam.core.session import CHUNK, Session, Step, capacity_at
 from ratslam.methods.method_registry import BACKENDS, BackendEntry, Sensors
 from ratslam.service.check_results import (
     Result,
+    Trial,
     Violation,
     check,
-    checks_of,
+    find_parts,
     leaves,
-    read_assignments,
     require,
     require_equal,
-    require_settings_class,
-    run_checks,
 )
 from tactile.base.errors import InputError
 from tactile.base.types import Observation, Odometry, observation
@@ -63,15 +61,8 @@ FEELERS = PlanarWhiskers(np.zeros((WHISKERS, 2)), _around, np.full(WHISKERS, REA
 SENSORS = {"with whiskers": Sensors(VIEW, FEELERS), "without whiskers": Sensors(VIEW)}
 
 
-class BackendTrial:
-    """A method with settings: what its checks share, and the checks.
-
-    Args:
-        settings: an instance of the entry's `config_class`.
-    """
-
-    def __init__(self, entry: BackendEntry, settings: Any) -> None:
-        self.entry, self.settings = entry, settings
+class BackendTrial(Trial[BackendEntry]):
+    """A method with settings: what its checks share, and the checks."""
 
     def build(self, dtype: Any = np.float64) -> Backend:
         """A new backend for the first sensors that suit it."""
@@ -88,19 +79,27 @@ class BackendTrial:
                 found[name] = str(error)
         return found
 
-    @property
-    def refusals(self) -> dict[str, str]:
-        """For sensors that the method refuses with an `InputError`: its text."""
-        return {name: made for name, made in self._built.items() if isinstance(made, str)}
-
     @cached_property
     def sensors(self) -> Sensors:
         """The sensors of the walks: with whiskers, unless the method refuses them."""
-        return next(sensors for name, sensors in SENSORS.items() if name not in self.refusals)
+        return next(SENSORS[name] for name, made in self._built.items() if not isinstance(made, str))
 
     def walk(self, count: int, seed: int = 0) -> list[Observation]:
-        """The first observations of a walk."""
-        return list(walk(count, seed, 0 if self.sensors.feelers is None else WHISKERS))
+        """The first observations of laps of a small circuit with repeated views; some steps have no view, and
+        in some the whiskers are in contact."""
+        stream, touch = np.random.default_rng(seed), np.random.default_rng([seed, 1])
+        whiskers = 0 if self.sensors.feelers is None else WHISKERS
+        places, walked = stream.random((CIRCUIT, *VIEW)), []
+        for k in range(count):
+            turn = 2 * np.pi / CIRCUIT + stream.normal(0, 0.01)
+            odometry = Odometry(0.05 + stream.normal(0, 0.002), stream.normal(0, 0.002), turn, 0.1)
+            seen, place = stream.random() > 0.1, k % CIRCUIT
+            view, label = (places[place], place) if seen else (None, -1)
+            o = observation(odometry, view, view_shape=VIEW, label=label, whiskers=whiskers)
+            contact = touch.random(WHISKERS)[:whiskers] < (0.2 if k % 5 == 0 else 0.0)
+            point = np.where(contact[:, None], REACH * _around[:whiskers], 0.0)
+            walked.append(o._replace(contact=contact, point=point))
+        return walked
 
     @property
     def backend(self) -> Backend:
@@ -156,19 +155,18 @@ class BackendTrial:
     @check(ENTRY, "the entry is complete", "a run needs settings, columns and outcomes by name")
     def entry_is_complete(self) -> str:
         entry = self.entry
-        require_settings_class(entry.config_class)
+        super().entry_is_complete.run(self)
         fields = getattr(entry.evidence, "_fields", ())
         require("outcome" in fields, f"evidence {entry.evidence!r}", "a NamedTuple with a field `outcome`")
-        outcomes = isinstance(entry.outcomes, type) and issubclass(entry.outcomes, IntEnum)
-        require(
-            outcomes and len(entry.outcomes) > 0, f"outcomes {entry.outcomes!r}", "an IntEnum with members"
-        )
+        kind = entry.outcomes
+        sound = isinstance(kind, type) and issubclass(kind, IntEnum) and len(kind) > 0
+        require(sound, f"outcomes {kind!r}", "an IntEnum with members")
         columns = ", ".join(entry.columns())
         return f"columns {columns}" if columns else ""
 
     @check(ENTRY, "it builds", "a run builds it from its settings and the sensors of the source")
     def builds(self) -> str:
-        refused = self.refusals
+        refused = {name: made for name, made in self._built.items() if isinstance(made, str)}
         if len(refused) == 2:
             found = "; ".join(f"{name}: {text}" for name, text in refused.items())
             raise Violation(found, "a backend for views of (3, 6, 1) with or without whiskers")
@@ -179,10 +177,8 @@ class BackendTrial:
         for part, protocol in ((self.backend, Backend), (self.backend.new_map(), Map)):
             needed = [name for name, _ in inspect.getmembers(protocol, inspect.isfunction) if name[0] != "_"]
             missing = [name for name in needed if not callable(getattr(part, name, None))]
-            found = f"{type(part).__name__} without {', '.join(missing)}"
-            require(
-                not missing, found, f"the methods of ratslam.core.backend.{protocol.__name__}; inherit it"
-            )
+            found, name = f"{type(part).__name__} without {', '.join(missing)}", protocol.__name__
+            require(not missing, found, f"the methods of ratslam.core.backend.{name}; inherit it")
 
     @check(KERNEL, "the kernel keeps the state's types", "a chunk scans the kernel, and would not compile")
     def keeps_types_of_state(self) -> None:
@@ -190,18 +186,14 @@ class BackendTrial:
         structures = [str(jax.tree.structure(state)) for state in (before, after)]
         if structures[0] != structures[1]:
             raise Violation(" becomes ".join(structures), "the state's structure unchanged")
-        pairs = zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True)
         changes = [
-            f"state{jax.tree_util.keystr(path)} is {_kind(old)} before a step and {_kind(new)} after it"
-            for (path, old), new in pairs
+            f"{path} is {_kind(old)} before a step and {_kind(new)} after it"
+            for (path, old), new in zip(_state_leaves(before), jax.tree.leaves(after), strict=True)
             if _kind(old) != _kind(new)
         ]
         require(not changes, "; ".join(changes), "the same shape, dtype and weak type")
-        weak = [
-            jax.tree_util.keystr(path) for path, leaf in jax.tree.leaves_with_path(before) if leaf.weak_type
-        ]
-        found = f"weakly typed state{', state'.join(weak)}"
-        require(not weak, found, "arrays with a dtype, as jnp.zeros(n, dtype) makes")
+        weak = ", ".join(path for path, leaf in _state_leaves(before) if leaf.weak_type)
+        require(not weak, f"weakly typed {weak}", "arrays with a dtype, as jnp.zeros(n, dtype) makes")
 
     @check(
         KERNEL,
@@ -209,22 +201,18 @@ class BackendTrial:
         "a float32 session would compute in float64, or not at all",
     )
     def state_has_precision(self) -> None:
-        for dtype in (np.float64, np.float32):
-            backend = self.backend if dtype == np.float64 else self.build(dtype)
-            name = np.dtype(dtype).name
-            state = jax.eval_shape(
-                lambda key, backend=backend: backend.init(key, CAPACITY), jax.random.key(0)
-            )
-            wrong = [
+        key = jax.random.key(0)
+        for name in ("float64", "float32"):
+            backend = self.backend if name == "float64" else self.build(name)
+            state = jax.eval_shape(lambda key, backend=backend: backend.init(key, CAPACITY), key)
+            wrong = ", ".join(
                 f"state{jax.tree_util.keystr(path)} {leaf.dtype}"
                 for path, leaf in jax.tree.leaves_with_path(state)
                 if jax.dtypes.issubdtype(leaf.dtype, np.floating)
-                and leaf.dtype != dtype
+                and leaf.dtype != name
                 and getattr(path[0], "name", "") not in backend.SINGLE
-            ]
-            require(
-                not wrong, f"{', '.join(wrong)} in a {name} session", f"{name}, the dtype given to `build`"
             )
+            require(not wrong, f"{wrong} in a {name} session", f"{name}, the dtype given to `build`")
 
     @check(KERNEL, "the estimate has its types", "run directories and maps are written from it")
     def estimate_has_types(self) -> None:
@@ -271,12 +259,13 @@ class BackendTrial:
     def is_finite_after_invalid_input(self) -> None:
         first = self.walk(1)[0]
         still = first._replace(view=np.full(VIEW, 0.5), view_seen=np.bool_(True), label=np.int32(3))
-        odd = still._replace(odometry=Odometry(*map(np.float64, (np.nan, np.inf, 0.0, 0.1))))
+        odd, endless = (
+            still._replace(odometry=Odometry(*map(np.float64, (*motion, 0.1))))
+            for motion in ((np.nan, np.inf, 0.0), (0.0, 0.0, -np.inf))
+        )
         inputs = {
             "odometry of NaN": odd,
-            "odometry of infinity": still._replace(
-                odometry=Odometry(*map(np.float64, (0.0, 0.0, -np.inf, 0.1)))
-            ),
+            "odometry of infinity": endless,
             "a view of NaN": still._replace(view=np.full(VIEW, np.nan)),
             "no view": still._replace(view=np.zeros(VIEW), view_seen=np.bool_(False), label=np.int32(-1)),
             "an ordinary step after these": still,
@@ -385,9 +374,8 @@ class BackendTrial:
             for r, run in enumerate(runs):
                 alone[r], expected, _ = one(alone[r], run[k])
                 same = np.allclose(estimate.pose[r], expected.pose, atol=1e-9)
-                same &= bool(estimate.place[r] == expected.place) & bool(
-                    estimate.action[r] == expected.action
-                )
+                same &= bool(estimate.place[r] == expected.place)
+                same &= bool(estimate.action[r] == expected.action)
                 found = f"pose {estimate.pose[r]} in a batch and {expected.pose} alone at step {k}"
                 require(same, found, "the same estimate within 1e-9")
 
@@ -397,10 +385,8 @@ class BackendTrial:
         for k, step in enumerate(self.steps):
             place, action = int(step.estimate.place), Action(int(step.estimate.action))
             what = f"action {action.name} from place {previous} to {place} at step {k}"
-            found = f"previous {int(step.estimate.previous)} at step {k}"
-            require(
-                int(step.estimate.previous) == previous, found, f"{previous}, the place of the step before"
-            )
+            before, expected = int(step.estimate.previous), f"{previous}, the place of the step before"
+            require(before == previous, f"previous {before} at step {k}", expected)
             if action == Action.CREATE:
                 require(place not in known, what, "a place that is new")
             elif action in (Action.LINK, Action.SET):
@@ -417,17 +403,10 @@ class BackendTrial:
         _require_finite(steps, "a walk in float32")
         grown = session.backend.grow(session.state, 2 * CAPACITY)
         kinds = {"state": session.state, "state after `grow`": grown}
-        wrong = [
-            f"{name}{jax.tree_util.keystr(path)}"
-            for name, tree in kinds.items()
-            for path, leaf in jax.tree.leaves_with_path(tree)
-            if leaf.dtype == np.float64
-        ]
-        for name, record in (("estimate", steps[-1].estimate), ("evidence", steps[-1].evidence)):
-            # The map may complete the estimate with Python numbers.
-            wrong += [
-                path for path, leaf in leaves(record, name) if getattr(leaf, "dtype", None) == np.float64
-            ]
+        found = [leaf for name, state in kinds.items() for leaf in _state_leaves(state, name)]
+        found += [*leaves(steps[-1].estimate, "estimate"), *leaves(steps[-1].evidence, "evidence")]
+        # The map may complete the estimate with Python numbers.
+        wrong = [path for path, leaf in found if getattr(leaf, "dtype", None) == np.float64]
         require(not wrong, f"float64 in {', '.join(wrong)} of a float32 session", "float32")
 
     @check(SESSION, "trajectories are [T, 3] and finite", "trajectory.tum is written from them")
@@ -447,9 +426,8 @@ class BackendTrial:
             require(sound, f"closures {pairs.dtype} {pairs.shape} after {count} steps", "integers (M, 2)")
             later, earlier = pairs.T
             ordered = bool(((earlier >= 0) & (earlier < later) & (later < count)).all())
-            require(
-                ordered, f"closures {pairs[:3].tolist()} of {count} steps", "later and earlier step of each"
-            )
+            found = f"closures {pairs[:3].tolist()} of {count} steps"
+            require(ordered, found, "later and earlier step of each")
         return f"{len(pairs)} closures"
 
     @check(SESSION, "every step is in a piece", "plots and scores treat pieces separately")
@@ -457,13 +435,11 @@ class BackendTrial:
         for count, made in self._maps():
             pieces = np.asarray(made.pieces())
             sound = pieces.shape == (count,) and pieces.dtype.kind in "iu"
-            require(
-                sound, f"pieces {pieces.dtype} {pieces.shape} after {count} steps", f"integers ({count},)"
-            )
+            found = f"pieces {pieces.dtype} {pieces.shape} after {count} steps"
+            require(sound, found, f"integers ({count},)")
         numbers = sorted(set(pieces.tolist()))
-        require(
-            pieces[0] == 0 and numbers == list(range(len(numbers))), f"pieces {numbers}", "numbers from 0"
-        )
+        sound = pieces[0] == 0 and numbers == list(range(len(numbers)))
+        require(sound, f"pieces {numbers}", "numbers from 0")
 
     @check(SESSION, "doubt is a probability", "a doubted map is replaced by odometry")
     def gives_doubt(self) -> None:
@@ -496,26 +472,6 @@ class BackendTrial:
             require(sound, found, "NumPy arrays of numbers by name")
 
 
-def walk(count: int, seed: int = 0, whiskers: int = WHISKERS) -> Iterator[Observation]:
-    """Laps of a small circuit with repeated views; some steps have no view, and in some the whiskers are in
-    contact."""
-    stream, touch = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-    places = stream.random((CIRCUIT, *VIEW))
-    for k in range(count):
-        turn = 2 * np.pi / CIRCUIT + stream.normal(0, 0.01)
-        odometry = Odometry(0.05 + stream.normal(0, 0.002), stream.normal(0, 0.002), turn, 0.1)
-        seen, place = stream.random() > 0.1, k % CIRCUIT
-        o = observation(
-            odometry,
-            places[place] if seen else None,
-            view_shape=VIEW,
-            label=place if seen else -1,
-            whiskers=whiskers,
-        )
-        contact = touch.random(WHISKERS)[:whiskers] < (0.2 if k % 5 == 0 else 0.0)
-        yield o._replace(contact=contact, point=np.where(contact[:, None], REACH * _around[:whiskers], 0.0))
-
-
 def _require_finite(steps: list[Step], what: str) -> None:
     for k, step in enumerate(steps):
         record = {"pose of the map": step.pose, "pose": step.estimate.pose, "spread": step.estimate.spread}
@@ -524,23 +480,17 @@ def _require_finite(steps: list[Step], what: str) -> None:
 
 
 def check_backend(name: str, assignments: Sequence[str] = ()) -> Iterator[Result]:
-    """Checks the method registered under a name.
-
-    Args:
-        assignments: of its settings, each `settings.key=value`.
-
-    Raises:
-        InputError: there is no such method, its package is broken, or the settings do not fit it.
-    """
-    entry = BACKENDS.get(name, "check backend")
-    settings = read_assignments({"settings": entry.config_class}, assignments)["settings"]
+    """Checks the method of a name, with its settings as assignments `settings.key=value`; raises as
+    `find_parts`."""
+    entry, settings = find_parts({"settings": (BACKENDS, name, "check backend")}, assignments)["settings"]
     prepare_precision("float64")
-    return run_checks(CHECKS, BackendTrial(entry, settings))
+    return BackendTrial(entry, settings).run_checks()
+
+
+def _state_leaves(state: Any, name: str = "state") -> list[tuple[str, Any]]:
+    """The arrays of a state, each with its path."""
+    return [(name + jax.tree_util.keystr(path), leaf) for path, leaf in jax.tree.leaves_with_path(state)]
 
 
 def _kind(leaf: Any) -> str:
     return f"{'weak ' if leaf.weak_type else ''}{leaf.dtype} {leaf.shape}"
-
-
-CHECKS = checks_of(BackendTrial)
-"""All checks of a method."""

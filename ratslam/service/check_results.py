@@ -1,26 +1,27 @@
 """Conformance checks: a requirement with its reason, its result, the runner, and what checks share.
 
-A part under test (a backend, source, touch front end or metric with settings) is a class whose methods marked
-by `check` are its checks. `require`, `require_equal` (the same bits of nested records) and `read_assignments`
-serve them all.
+A kind of part (backend, source, touch front end, metric) is a `Trial` whose methods marked by `check` are its
+checks. `require`, `require_equal` (the same bits of nested records) and `find_parts` serve them all.
 """
 
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from enum import Enum
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from ratslam.runs.settings.strict_yaml import override, validate
 from ratslam.runs.settings.yaml_document import Document, Place
 from tactile.base.errors import InputError
+from tactile.base.plugins import Registry
 from tactile.base.settings import Settings
 
+Entry = TypeVar("Entry")
 LONGEST_MESSAGE = 300
 """Length at which the text of a foreign exception is cut off."""
 
@@ -34,7 +35,6 @@ class Violation(Exception):
 
     def __init__(self, found: str, expected: str) -> None:
         super().__init__(f"{found}; expected {expected}")
-        self.found, self.expected = found, expected
 
 
 class Check(NamedTuple):
@@ -53,13 +53,8 @@ class Check(NamedTuple):
 
 
 def check(group: int, name: str, reason: str) -> Callable[[Callable[[Any], str | None]], Check]:
-    """Decorator that makes a check of a method of a class of parts under test; see `checks_of`."""
+    """Decorator that makes a check of a method of a `Trial`."""
     return lambda run: Check(name, reason, group, run)
-
-
-def checks_of(trial: type) -> tuple[Check, ...]:
-    """The checks in a class, in the order of its text, which is that of their groups."""
-    return tuple(member for member in vars(trial).values() if isinstance(member, Check))
 
 
 class Result(NamedTuple):
@@ -80,32 +75,55 @@ class Result(NamedTuple):
         return f"{self.status:<5} {self.check.name}{self.text and ': '}{self.text}{reason}"
 
 
-def run_checks(checks: Iterable[Check], part: Any) -> Iterator[Result]:
-    """Runs the checks of one group after another; a group after one with a failed check is not run.
+class Trial(Generic[Entry]):
+    """A registered part under test with its settings; its methods marked by `check` are the requirements.
 
-    An exception of the part under test is a failure, described by its type, text and place in one line.
+    Args:
+        settings: an instance of the entry's `config_class`.
     """
-    sound = True
-    for _, group in groupby(checks, lambda check: check.group):
-        results = []
-        for check in group:
-            result = Result(check, "-", "not run after the failures above")
-            if sound:
-                try:
-                    result = Result(check, "ok", check.run(part) or "")
-                except Violation as violation:
-                    result = Result(check, "FAIL", str(violation))
-                except Exception as error:  # whatever foreign code raises
-                    text = " ".join(str(error).split())
-                    text = text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}..."
-                    frames = traceback.extract_tb(error.__traceback__)
-                    own = [frame for frame in frames if "jax" not in Path(frame.filename).parts] or frames
-                    at = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
-                    text = f"{type(error).__name__}: {text}{at}; expected no exception"
-                    result = Result(check, "FAIL", text)
-            results.append(result)
-            yield result
-        sound = all(result.status == "ok" for result in results)
+
+    def __init__(self, entry: Entry, settings: Any) -> None:
+        self.entry, self.settings = entry, settings
+
+    @classmethod
+    def checks(cls) -> tuple[Check, ...]:
+        """The checks in the order of the text, which is that of their groups."""
+        members = {name: member for kind in reversed(cls.__mro__) for name, member in vars(kind).items()}
+        return tuple(member for member in members.values() if isinstance(member, Check))
+
+    def run_checks(self) -> Iterator[Result]:
+        """Runs the checks of one group after another; a group after one with a failed check is not run.
+
+        An exception of the part under test is a failure, described by its type, text and place in one line.
+        """
+        sound = True
+        for _, group in groupby(self.checks(), lambda check: check.group):
+            results = []
+            for check in group:
+                result = Result(check, "-", "not run after the failures above")
+                if sound:
+                    try:
+                        result = Result(check, "ok", check.run(self) or "")
+                    except Violation as violation:
+                        result = Result(check, "FAIL", str(violation))
+                    except Exception as error:  # whatever foreign code raises
+                        text = " ".join(str(error).split())
+                        text = text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}..."
+                        frames = traceback.extract_tb(error.__traceback__)
+                        own = [frame for frame in frames if "jax" not in Path(frame.filename).parts] or frames
+                        at = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+                        text = f"{type(error).__name__}: {text}{at}; expected no exception"
+                        result = Result(check, "FAIL", text)
+                results.append(result)
+                yield result
+            sound = all(result.status == "ok" for result in results)
+
+    @check(0, "the entry is complete", "a configuration names it with its settings")
+    def entry_is_complete(self) -> str | None:
+        model: Any = getattr(self.entry, "config_class", None)
+        sound = isinstance(model, type) and issubclass(model, Settings)
+        require(sound, f"config_class {model!r}", "a subclass of tactile.base.settings.Settings")
+        return None
 
 
 def require(condition: bool, found: str, expected: str) -> None:
@@ -132,9 +150,8 @@ def _difference(first: Any, second: Any, path: str = "") -> str:
         parts = [(f"{path}[{key!r}]", first[key], second[key]) for key in first]
     elif isinstance(first, list | tuple) and isinstance(second, list | tuple):
         if type(first) is not type(second) or len(first) != len(second):
-            return (
-                f"{path} {type(first).__name__} of {len(first)} and {type(second).__name__} of {len(second)}"
-            )
+            kinds = (f"{type(one).__name__} of {len(one)}" for one in (first, second))
+            return f"{path} {' and '.join(kinds)}"
         names = [f".{n}" for n in getattr(first, "_fields", ())] or [f"[{k}]" for k in range(len(first))]
         parts = [(path + name, a, b) for name, a, b in zip(names, first, second, strict=True)]
     elif (
@@ -172,32 +189,36 @@ def leaves(record: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, record
 
 
-def require_settings_class(model: Any) -> None:
-    """Raises `Violation` unless a registered part's `config_class` is a model of settings."""
-    sound = isinstance(model, type) and issubclass(model, Settings)
-    require(sound, f"config_class {model!r}", "a subclass of tactile.base.settings.Settings")
-
-
-def read_assignments(
-    models: dict[str, Any], assignments: Sequence[str], option: str = "--set"
-) -> dict[str, Settings | None]:
-    """The settings of registered parts, each from the assignments `SECTION.key=value`.
+def find_parts(
+    named: dict[str, tuple[Registry[Any], str | None, str]], assignments: Sequence[str]
+) -> dict[str, tuple[Any, Any]]:
+    """Registered parts, each with its settings, by the section of the assignments `SECTION.key=value`.
 
     Args:
-        models: config class by section; a section whose class is no model of settings gives None.
+        named: by section the registry, the name in it (None: no part), and the place of the name for errors.
+
+    Returns:
+        entry and settings by section; no settings if the entry's `config_class` is no model of settings.
 
     Raises:
-        InputErrors: an assignment names another section, or the settings do not fit their model.
+        InputErrors: there is no part of that name, its package is broken, an assignment names another
+            section, or the settings do not fit their model.
     """
+    entries = {
+        section: registry.get(name, where)
+        for section, (registry, name, where) in named.items()
+        if name is not None
+    }
     for assignment in assignments:
         section = assignment.partition("=")[0].partition(".")[0]
-        if section not in models:
-            keys = " or ".join(f"{name}.key=value" for name in models)
-            raise InputError(f"{option} {assignment}", f"the section '{section}'", keys)
-    document = override(Document({}, {(): Place(option, option)}), assignments)
-    return {
-        section: validate(document.section((section,)), model)
-        if isinstance(model, type) and issubclass(model, Settings)
-        else None
-        for section, model in models.items()
-    }
+        if section not in entries:
+            keys = " or ".join(f"{name}.key=value" for name in entries)
+            raise InputError(f"--set {assignment}", f"the section '{section}'", keys)
+    document = override(Document({}, {(): Place("--set", "--set")}), assignments)
+    parts = {}
+    for section, entry in entries.items():
+        model, settings = entry.config_class, None
+        if isinstance(model, type) and issubclass(model, Settings):
+            settings = validate(document.section((section,)), model)
+        parts[section] = entry, settings
+    return parts

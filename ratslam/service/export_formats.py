@@ -26,7 +26,7 @@ from ratslam.classic.config import NetworkConfig, network_of
 from ratslam.core.compilation import prepare_precision
 from ratslam.mapping.pose_graph import read_json
 from ratslam.runs.settings.run_config import load_config
-from ratslam.service.ros_bag import RosMessages, read_exported_run, write_bag, write_mcap
+from ratslam.service.ros_bag import RosRun
 from ratslam.service.spikes import (
     SpikeConfig,
     SpikeTrains,
@@ -82,51 +82,38 @@ def write_nwb(path: Path, recording: CellRecording, spikes: SpikeTrains, digest:
         session_start_time=EPOCH,
         file_create_date=EPOCH,
     )
-    _add_behaviour(pynwb, file, recording)
-    _add_cells(pynwb, file, recording)
-    _add_units(file, recording, spikes)
-    with pynwb.NWBHDF5IO(path, "w") as output:
-        output.write(file)
-    _fix_ids(path, digest)
-
-
-def _add_behaviour(pynwb: Any, file: Any, recording: CellRecording) -> None:
-    """The true pose and the decoded packet, on one array of times."""
     module = file.create_processing_module("behavior", "true pose of the robot and decoded packet")
     packet = packet_poses(recording.shape, recording.cell_size, recording.packet)
-    frame = TORUS_FRAME.format(side=recording.shape[2] * recording.cell_size)
-    true = _pose_series(pynwb, "", np.asarray(recording.truth, float), recording.time, TRUE_FRAME)
-    decoded = _pose_series(pynwb, "packet_", packet, true[0], frame)
-    for (place, direction), (position, heading) in ((TRUE_NAMES, true), (PACKET_NAMES, decoded)):
-        module.add(pynwb.behavior.Position(name=place, spatial_series=position))
-        module.add(pynwb.behavior.CompassDirection(name=direction, spatial_series=heading))
-
-
-def _pose_series(pynwb: Any, prefix: str, pose: np.ndarray, timestamps: Any, frame: str) -> tuple[Any, Any]:
-    """Position and heading of poses [T, 3]; timestamps: [T] s, or the series whose times they share."""
-    make = pynwb.behavior.SpatialSeries
-    position = make(
-        name=f"{prefix}position", data=pose[:, :2], timestamps=timestamps, unit="meters",
-        reference_frame=frame,
-    )  # fmt: skip
-    heading = make(
-        name=f"{prefix}heading", data=wrap(pose[:, 2]), timestamps=position, unit="radians",
-        reference_frame=HEADING_FRAME,
-    )  # fmt: skip
-    return position, heading
-
-
-def _add_cells(pynwb: Any, file: Any, recording: CellRecording) -> None:
-    """Activity of the chosen cells and injected energy."""
-    times = file.processing["behavior"]["Position"]["position"]
+    torus = TORUS_FRAME.format(side=recording.shape[2] * recording.cell_size)
+    true = np.asarray(recording.truth, float)
+    times: Any = recording.time  # the first series holds them, the others refer to it
+    for names, prefix, pose, frame in (
+        (TRUE_NAMES, "", true, TRUE_FRAME),
+        (PACKET_NAMES, "packet_", packet, torus),
+    ):
+        make = pynwb.behavior.SpatialSeries
+        times = position = make(
+            name=f"{prefix}position", data=pose[:, :2], timestamps=times, unit="meters",
+            reference_frame=frame,
+        )  # fmt: skip
+        heading = make(
+            name=f"{prefix}heading", data=wrap(pose[:, 2]), timestamps=position, unit="radians",
+            reference_frame=HEADING_FRAME,
+        )  # fmt: skip
+        module.add(pynwb.behavior.Position(name=names[0], spatial_series=position))
+        module.add(pynwb.behavior.CompassDirection(name=names[1], spatial_series=heading))
     texts = {
         "activity": (recording.activity, "of the cells of the table units; that of all cells sums to 1"),
         "injected_energy": (recording.energy, "activity injected at the recalled pose by views"),
     }
     for name, (data, text) in texts.items():
-        file.add_acquisition(
-            pynwb.TimeSeries(name=name, data=data, timestamps=times, unit="1", description=text)
-        )
+        shown = module["Position"]["position"]
+        series = pynwb.TimeSeries(name=name, data=data, timestamps=shown, unit="1", description=text)
+        file.add_acquisition(series)
+    _add_units(file, recording, spikes)
+    with pynwb.NWBHDF5IO(path, "w") as output:
+        output.write(file)
+    _fix_ids(path, digest)
 
 
 def _add_units(file: Any, recording: CellRecording, spikes: SpikeTrains) -> None:
@@ -191,16 +178,15 @@ def export_run(
     config = spikes or SpikeConfig()
     match suffix:
         case "" | ".mcap":
-            ros = RosMessages()
-            exported = read_exported_run(directory, warn)
-            if exported.run.has_pieces:
+            messages = RosRun(directory, warn)
+            if messages.run.has_pieces:
                 beside = "the file shows them beside each other, or each where it is true if that is known"
                 warn(f"{PARTED}; {beside}")
             if suffix:
-                make_new_file(output, lambda path: write_mcap(path, exported, ros))
+                make_new_file(output, messages.write_mcap)
                 return
             with new_folder(output) as folder:
-                write_bag(folder, output.name, exported, ros)
+                messages.write_bag(folder, output.name)
         case ".tum":
             _write_tum(directory, output, warn)
         case ".g2o" | ".json":

@@ -15,17 +15,7 @@ from evaluation.metrics.metric import Finding, Metric
 from evaluation.metrics.metric_registry import METRICS, MetricEntry
 from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import RUN_METRICS, RunData, run_data
-from ratslam.service.check_results import (
-    Result,
-    Violation,
-    check,
-    checks_of,
-    read_assignments,
-    require,
-    require_equal,
-    require_settings_class,
-    run_checks,
-)
+from ratslam.service.check_results import Result, Trial, Violation, check, find_parts, require, require_equal
 from tactile.base.se2 import integrate
 
 LAPS, PLACES = 3, 36
@@ -36,44 +26,18 @@ ENTRY, VALUES = range(2)
 
 
 def check_metric(name: str, assignments: Sequence[str] = ()) -> Iterator[Result]:
-    """Checks the metric registered under a name.
-
-    Args:
-        assignments: of its settings, each `settings.key=value`.
-
-    Raises:
-        InputError: there is no such metric, its package is broken, or the settings do not fit it.
-    """
-    entry = METRICS.get(name, "check metric")
-    settings = read_assignments({"settings": entry.config_class}, assignments)["settings"]
-    return run_checks(CHECKS, MetricTrial(entry, settings))
+    """Checks the metric of a name, with its settings as assignments `settings.key=value`; raises as
+    `find_parts`."""
+    entry, settings = find_parts({"settings": (METRICS, name, "check metric")}, assignments)["settings"]
+    return MetricTrial(entry, settings).run_checks()
 
 
-class MetricTrial:
-    """A metric with settings: the runs that its checks share, and the checks.
-
-    Args:
-        settings: an instance of the entry's `config_class`.
-    """
-
-    def __init__(self, entry: MetricEntry, settings: Any) -> None:
-        self.entry, self.settings = entry, settings
+class MetricTrial(Trial[MetricEntry]):
+    """A metric with settings, and its checks."""
 
     @cached_property
     def metric(self) -> Metric:
         return self.entry.build(self.settings)
-
-    @cached_property
-    def with_truth(self) -> RunData:
-        return _data(_synthetic_run())
-
-    @cached_property
-    def without_truth(self) -> RunData:
-        return _data(_synthetic_run()._replace(truth=None))
-
-    @check(ENTRY, "the entry is complete", "a configuration names it with its settings")
-    def entry_is_complete(self) -> None:
-        require_settings_class(self.entry.config_class)
 
     @check(ENTRY, "name, label and unit are well-formed", "scorecard.json and tables show them")
     def is_named(self) -> str:
@@ -97,7 +61,7 @@ class MetricTrial:
     @check(VALUES, "it computes with truth", "a scorecard holds numbers")
     def computes_with_truth(self) -> str:
         what = "a run with truth"
-        result = self.metric.compute(self.with_truth)
+        result = self.metric.compute(_data(_synthetic_run()))
         require(result is not None, f"None for {what}", "a Finding; None means that there is no truth")
         found = _require_finding(result, what)
         self.metric.quantity(found)
@@ -105,7 +69,7 @@ class MetricTrial:
 
     @check(VALUES, "it does without truth", "most recordings have none")
     def computes_without_truth(self) -> str:
-        result = self.metric.compute(self.without_truth)
+        result = self.metric.compute(_data(_synthetic_run()._replace(truth=None)))
         if result is None:
             return "no ground truth"
         found = _require_finding(result, "a run without truth")
@@ -181,7 +145,3 @@ def _require_finding(found: Any, what: str) -> Finding:
         require(number or none, f"{name} {value!r} of type {type(value).__name__} in {what}", "a number")
     require(isinstance(found.note, str), f"note {found.note!r} in {what}", "text")
     return found
-
-
-CHECKS = checks_of(MetricTrial)
-"""All checks of a metric."""

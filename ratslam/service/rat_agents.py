@@ -17,7 +17,7 @@ from ratslam.classic import pose_cells
 from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.levels import point_activity, to_full_torus, window_levels
 from ratslam.classic.pose_cells import LARGEST_SUBSTEP, MOST_SUBSTEPS, Outcome, PoseCells
-from ratslam.service.spikes import cell_poses, check_cells, settled_peak
+from ratslam.service.spikes import cell_poses, settled_peak
 from robot.simulation.rat.box import BoxConfig
 from robot.simulation.rat.rat_path import RatOdometryConfig, RatPath, measure_motion
 from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
@@ -105,9 +105,8 @@ def agent_in_box(agent: Any, config: RatSimulationConfig | None = None) -> RatSi
         left, right, bottom, top = np.asarray(agent.Environment.extent, float).tolist()
         if abs(left) > 1e-9 or abs(bottom) > 1e-9:
             cure = "give a configuration and move the environment to the origin"
-            raise InputError(
-                "agent", f"an environment from ({left:g}, {bottom:g}) on", "one from (0, 0)", cure
-            )
+            found = f"an environment from ({left:g}, {bottom:g}) on"
+            raise InputError("agent", found, "one from (0, 0)", cure)
         box = BoxConfig(width=right, height=top)
         config = RatSimulationConfig(box=box, rate_hz=round(1 / agent.dt, 6))
     return RatSimulation(config, path)
@@ -243,9 +242,8 @@ class PoseCellNeurons(Neurons):
         config: NetworkConfig = given["pose_cells"]
         shape = (config.cells_heading, config.cells_xy, config.cells_xy)
         cell = np.arange(np.prod(shape)) if given["cell"] is None else np.asarray(given["cell"])
-        check_cells(shape, cell)
-        super().__init__(Agent, {**given, "cell": cell, "n": len(cell)})
         self.cell_poses = cell_poses(shape, config.cell_size, cell)
+        super().__init__(Agent, {**given, "cell": cell, "n": len(cell)})
         self._peak = settled_peak(config)
         self._random = stream(self.seed, f"pose cell neurons {self.name}")
         self._pose, self._time = agent_pose(Agent), float(Agent.t)
@@ -268,9 +266,8 @@ class PoseCellNeurons(Neurons):
         """
         if evaluate_at not in ("agent", "last"):
             cure = "plot_rate_map(method='history') shows the history"
-            raise InputError(
-                "evaluate_at", repr(evaluate_at), "'agent': these cells depend on the path", cure
-            )
+            expected = "'agent': these cells depend on the path"
+            raise InputError("evaluate_at", repr(evaluate_at), expected, cure)
         rates: np.ndarray = self.max_fr / self._peak * self.network.activity[self.cell]
         return rates[:, None]
 

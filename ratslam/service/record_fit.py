@@ -8,10 +8,9 @@ revisits do not tell it. The signals of whiskers come from raw whisks, or from a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +31,7 @@ from robot.sources.odometry import UNCORRECTED, OdometryCorrection
 from robot.sources.source import Sample, SourceInfo
 from robot.touch_source import observation_of
 from robot.world.maze import parse_maze, wall_boxes
-from robot.world.walls import Surroundings, Walls
+from robot.world.walls import Surroundings
 from tactile.base.errors import InputError
 from tactile.base.plugins import PluginConfig, read_settings
 from tactile.base.random_streams import stream
@@ -52,18 +51,13 @@ DRIFT_BLOCK = 0.5
 
 
 def read_signals_of_reach(source: PluginConfig) -> SignalRecord:
-    """The signals of an arm that reaches through clutter."""
+    """The signals of an arm that reaches through clutter; as a source it gives contacts only."""
     config = read_settings(ReachConfig, source.settings, "source.settings")
     signal = read_reach(config.file).signal
     block = max(round(DRIFT_BLOCK * config.rate), 1)
     contact = (find_touches(config, signal) == Touch.CONTACT).mean(axis=0)
-    return SignalRecord(
-        signal[: config.free_rows], signal, block, block / config.rate, contact, WHISKERS, "counts"
-    )
-
-
-SIGNALS: dict[str, Callable[[PluginConfig], SignalRecord]] = {"whisker_reach": read_signals_of_reach}
-"""Registered sources whose files hold the signals of whiskers; as sources they give contacts only."""
+    free, apart = signal[: config.free_rows], block / config.rate
+    return SignalRecord(free, signal, block, apart, contact, WHISKERS, "counts")
 
 
 def _signals_of_cycles(samples: list[Sample]) -> SignalRecord:
@@ -132,10 +126,10 @@ def fit_record(config: RunConfig, seed: int = 0) -> Rig:
     Raises:
         InputError: the record cannot be read.
     """
-    if config.source is not None and config.source.plugin == PLUGIN:
+    if config.source is not None and config.source.plugin == "whisker_stage":
         return _fit_stage(config.source)
-    if config.source is not None and config.source.plugin in SIGNALS:
-        record = SIGNALS[config.source.plugin](config.source)
+    if config.source is not None and config.source.plugin == "whisker_reach":
+        record = read_signals_of_reach(config.source)
         return _signal_rig(record, fit_signals(record), registered=True)
     plain = _without_correction(config)
     with open_source(plain) as source:
@@ -186,15 +180,13 @@ def fit_wheels_of(config: RunConfig, completed: RunConfig, samples: list[Sample]
 
 def _from_truth(fit: WheelFit, assumed: OdometryCorrection, completed: RunConfig) -> Rig:
     noise, cell = completed.keyframes.noise, completed.pose_cells.cell_size
-    quantities = [_scale("length", assumed.length_scale, fit.length_scale)]
     unknown = []
     if fit.turn_scale is None:
         turned = f"the robot turns {fit.turned:.2g} rad in all"
         unknown.append(f"turn scale: {turned}; at least {LEAST_TURNED:.2g} rad are needed")
-    else:
-        quantities.append(_scale("turn", assumed.turn_scale, fit.turn_scale))
-    quantities += [
-        _bias(assumed.heading_bias, fit.heading_bias),
+    known = {key: found for key in WHEELS if (found := getattr(fit, key)) is not None}
+    quantities = [
+        *(_of_wheels(key, assumed, found) for key, found in known.items()),
         Quantity("heading noise", noise.heading_per_cell / np.sqrt(cell), *fit.heading_noise, "rad/sqrt(m)"),
         Quantity("turn noise", noise.heading_per_radian, *fit.turn_noise, "rad/sqrt(rad)"),
         Quantity("position noise", noise.per_cell * np.sqrt(cell), *fit.position_noise, "m/sqrt(m)"),
@@ -212,21 +204,13 @@ def _from_revisits(config: RunConfig, samples: list[Sample], assumed: OdometryCo
         return Rig(unknown=("wheels: the record has no true poses",))
     scale = "length scale: no true poses, and a map closes its loops at any scale"
     if not any(shows_place(sample.reading) for sample in samples):
-        return Rig(
-            unknown=(scale, "turn scale, heading bias: no true poses, and no views that tell revisits")
-        )
-    found = fit_revisits(config)
+        reason = "no true poses, and no views that tell revisits"
+        return Rig(unknown=(scale, f"turn scale, heading bias: {reason}"))
+    found = fit_revisits(config, assumed)
     if found is None:
         reason = "no true poses, and the map closes no loops or is doubted"
         return Rig(unknown=(scale, f"turn scale, heading bias: {reason}"))
-    quantities = [_bias(assumed.heading_bias, found.heading_bias)]
-    if found.turn_scale is not None:
-        quantities.insert(0, _scale("turn", assumed.turn_scale, found.turn_scale))
-    note = (
-        f"wheels: from the {found.closures} loop closures of a map (doubt {found.doubt:.2f}); the standard "
-        "deviations take these closures as true"
-    )
-    return Rig(tuple(quantities), notes=(note,), unknown=(scale,))
+    return found._replace(unknown=(scale,))
 
 
 def shows_place(reading: Any) -> bool:
@@ -234,13 +218,13 @@ def shows_place(reading: Any) -> bool:
     return not isinstance(reading, Observation) or bool(reading.view_seen) or int(reading.label) >= 0
 
 
-def _scale(name: str, assumed: float, found: tuple[float, float]) -> Quantity:
-    unit = {"length": "m/m", "turn": "rad/rad"}[name]
-    return Quantity(f"{name} scale", assumed, *found, unit, f"recording.odometry.{name}_scale")
+WHEELS = {"length_scale": "m/m", "turn_scale": "rad/rad", "heading_bias": "rad/m"}
+"""Settings of `recording.odometry` and their units."""
 
 
-def _bias(assumed: float, found: tuple[float, float]) -> Quantity:
-    return Quantity("heading bias", assumed, *found, "rad/m", "recording.odometry.heading_bias")
+def _of_wheels(key: str, assumed: OdometryCorrection, found: tuple[float, float]) -> Quantity:
+    name, setting = key.replace("_", " "), f"recording.odometry.{key}"
+    return Quantity(name, getattr(assumed, key), *found, WHEELS[key], setting)
 
 
 DELAY = (
@@ -265,7 +249,8 @@ def _fit_head(config: RunConfig, samples: list[Sample], info: SourceInfo) -> Rig
     assumed = config.touch.head
     frontend = Frontend(config.touch, info.calibration)
     whisks = [frontend.features(sample.reading) for sample in rows]
-    walls = walls_of(info)
+    maze = parse_maze(info.maze.text, Path("maze of the recording"))
+    walls = wall_boxes(maze, stream(info.maze.seed, "maze.heights"), info.maze.heights)
     pose = np.array([sample.truth for sample in rows])
 
     def predict(head: HeadConfig) -> np.ndarray:
@@ -296,14 +281,6 @@ def _fit_head(config: RunConfig, samples: list[Sample], info: SourceInfo) -> Rig
     return Rig(tuple(quantities), settings, (note, DELAY), tuple(unknown))
 
 
-def walls_of(info: SourceInfo) -> Walls:
-    """The walls of the maze of a source."""
-    assert info.maze is not None
-    maze = parse_maze(info.maze.text, Path("maze of the recording"))
-    return wall_boxes(maze, stream(info.maze.seed, "maze.heights"), info.maze.heights)
-
-
-PLUGIN = "whisker_stage"
 FOLDS, BLOCK = 3, 10
 """Parts of the rows held out in turn, and consecutive rows held out together: neighbours are alike."""
 
@@ -318,20 +295,19 @@ def _fit_stage(source: PluginConfig) -> Rig:
     position, signal, base = read_stage_calibration(settings.file)
     # Root mean square errors over the channels of each row held out: of the map, and of the mean signal.
     errors = np.zeros((2, len(signal)))
+    part = np.arange(len(signal)) // BLOCK % FOLDS
+    folds = [part == k for k in range(FOLDS)]
     try:
-        for fold in _folds(len(signal)):
+        for fold in folds:
             known = fit_signal_map(position[~fold], signal[~fold], base)
-            for out, mean in zip(
-                errors,
-                (known(position[fold]), signal[~fold].mean(axis=0)),
-                strict=True,
-            ):
+            predictions = known(position[fold]), signal[~fold].mean(axis=0)
+            for out, mean in zip(errors, predictions, strict=True):
                 out[fold] = np.sqrt(((signal[fold] - mean) ** 2).mean(axis=1))
     except InputError as reason:
         return Rig(unknown=(f"stage-to-signal map: {reason}",))
     size = float(np.sqrt((signal**2).mean()))
     error, control = (float(np.median(part)) for part in errors)
-    share = [100 * float(np.median(errors[0][fold])) / size for fold in _folds(len(signal))]
+    share = [100 * float(np.median(errors[0][fold])) / size for fold in folds]
     quantities = (
         Quantity("signal, rms", None, size, None, "counts"),
         Quantity("error of the map, held out", None, 100 * error / size, float(np.std(share)), "% of rms"),
@@ -342,29 +318,9 @@ def _fit_stage(source: PluginConfig) -> Rig:
     return Rig(quantities, notes=(note,), unknown=unknown)
 
 
-def _folds(rows: int) -> list[np.ndarray]:
-    """[N] bool for each part."""
-    part = np.arange(rows) // BLOCK % FOLDS
-    return [part == k for k in range(FOLDS)]
-
-
-class RevisitFit(NamedTuple):
-    """What the map of a record knows of the odometry, each as (value, standard deviation).
-
-    Attributes:
-        heading_bias: rad/m. turn_scale: true turn over that of the odometry; None where the map has no error
-            of turns. doubt: probability that the map is worse than the odometry. closures: number of accepted
-        loop closures.
-    """
-
-    heading_bias: tuple[float, float]
-    turn_scale: tuple[float, float] | None
-    doubt: float
-    closures: int
-
-
-def fit_revisits(config: RunConfig) -> RevisitFit | None:
-    """Maps the record of a configuration; None if the map closes no loops, is doubted or has no calibration.
+def fit_revisits(config: RunConfig, assumed: OdometryCorrection = UNCORRECTED) -> Rig | None:
+    """What the map of the record of a configuration knows of the odometry; None if it closes no loops, is
+    doubted or has no calibration. Some maps have no error of turns.
 
     Raises:
         InputError: the record cannot be mapped.
@@ -381,6 +337,12 @@ def fit_revisits(config: RunConfig) -> RevisitFit | None:
         file = Path(folder) / "calibration.yaml"
         write(file)
         found = load(file).data["keyframes"]["calibration"]
-    turn = (1 + found["turn_error"], found["turn_error_sd"]) if "turn_error" in found else None
-    bias = found["heading_bias"], found["heading_bias_sd"]
-    return RevisitFit(bias, turn, float(session.map.final_doubt()), closures)
+    quantities = [_of_wheels("heading_bias", assumed, (found["heading_bias"], found["heading_bias_sd"]))]
+    if "turn_error" in found:
+        turn = 1 + found["turn_error"], found["turn_error_sd"]
+        quantities.insert(0, _of_wheels("turn_scale", assumed, turn))
+    note = (
+        f"wheels: from the {closures} loop closures of a map (doubt {float(session.map.final_doubt()):.2f}); "
+        "the standard deviations take these closures as true"
+    )
+    return Rig(tuple(quantities), notes=(note,))

@@ -9,12 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.runs.build_session import open_source
-from ratslam.runs.map_settings import (
-    Sensor,
-    check_same_fov,
-    differing_settings,
-    settings_of_map,
-)
+from ratslam.runs.map_settings import Sensor, check_same_fov, differing_settings, settings_of_map
 from ratslam.runs.saved_map import SavedMap
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
@@ -53,28 +48,38 @@ SMALL = ImageViewConfig()
 """Smaller images are views of their own size."""
 SUFFIXES = (".csv", ".npz", ".mcap", *VIDEOS)
 """Of files that are read; besides them a folder, `.bag` and `.db3` are bags."""
-Rows = tuple[tuple[str, ...], ...]
 
 
-class _FileContents(NamedTuple):
-    """What a file holds.
+class Diagnosis(NamedTuple):
+    """What was found.
 
     Attributes:
-        what: one line. recording: settings of `recording` that read it, besides `file`; None if none do.
-        table, notes, faults: as in `Diagnosis`. max_range: of its ranges, m, NaN without ranges.
-        field_of_view: of its ranges, rad, counter-clockwise positive; None if unknown.
+        what: one line. table: rows of cells, the first row the heading; may be empty. notes: facts.
+            faults: what prevents a run, or speaks against a map. advice: what to do next.
+            config: sections of a configuration that reads the recording, {} if there is none.
     """
 
     what: str
-    recording: dict[str, Any] | None
-    table: Rows = ()
+    table: tuple[tuple[str, ...], ...] = ()
     notes: tuple[str, ...] = ()
     faults: tuple[str, ...] = ()
-    max_range: float = np.nan
-    field_of_view: float | None = None
+    advice: tuple[str, ...] = ()
+    config: dict[str, Any] = {}  # noqa: RUF012
+
+    def render(self) -> str:
+        """The diagnosis as lines of text."""
+        lines = [self.what, *(f"  {line}".rstrip() for line in aligned(self.table))]
+        for mark, texts in (("", self.notes), ("fault: ", self.faults), ("next: ", self.advice)):
+            lines += [f"{mark}{text}" for text in texts]
+        return "\n".join(map(printable, lines))
 
 
-def _describe_file(path: Path) -> _FileContents:
+_Found = tuple[Diagnosis, float, float | None]
+"""What a file holds: the diagnosis, with the settings of `recording` that read it, besides `file`, if any do;
+and of its ranges, NaN and None without any, the largest (m) and the field of view (rad)."""
+
+
+def _describe_file(path: Path) -> _Found:
     """What a recording holds.
 
     Raises:
@@ -90,21 +95,20 @@ def _describe_file(path: Path) -> _FileContents:
         return _describe_bag(path)
     if suffix not in SUFFIXES:
         found = f"no reader for {path.suffix!r} files" if path.suffix else "a file without a suffix"
-        raise InputError(
-            str(path), found, f"one of {', '.join([*SUFFIXES, '.bag', '.db3'])}, or the folder of a bag"
-        )
+        known = ", ".join([*SUFFIXES, ".bag", ".db3"])
+        raise InputError(str(path), found, f"one of {known}, or the folder of a bag")
     if suffix == ".csv":
         return _describe_csv(path)
     if suffix == ".npz":
         shapes = array_shapes(path).items()
         rows = (("array", "shape"), *((name, " x ".join(map(str, shape))) for name, shape in shapes if shape))
-        return _FileContents(f"{path}: arrays of a reference trace", {}, rows)
+        return Diagnosis(f"{path}: arrays of a reference trace", rows, config={"recording": {}}), np.nan, None
     if suffix == ".mcap":
-        return _FileContents(f"{path}: a recording of ratslam", {})
+        return Diagnosis(f"{path}: a recording of ratslam", config={"recording": {}}), np.nan, None
     return _describe_video(path)
 
 
-def _describe_csv(path: Path) -> _FileContents:
+def _describe_csv(path: Path) -> _Found:
     from robot.recordings.csv_description import describe_csv
 
     found = describe_csv(path.resolve())  # the settings name files beside it, from any folder
@@ -121,11 +125,11 @@ def _describe_csv(path: Path) -> _FileContents:
             notes.append(f"longest gap: {steps.max():.3g} s after t = {found.time[steps.argmax()]:.6g} s")
     if found.missing:
         notes.append(f"missing: {'; '.join(found.missing)}")
-    table = {"table": found.table} if found.table else None
-    return _FileContents(what, table, rows, tuple(notes), tuple(faults), found.max_range)
+    config = {"recording": {"table": found.table}} if found.table else {}
+    return Diagnosis(what, rows, tuple(notes), tuple(faults), config=config), found.max_range, None
 
 
-def _describe_bag(path: Path) -> _FileContents:
+def _describe_bag(path: Path) -> _Found:
     from robot.recordings.bags.bag_description import describe_bag, robots_of, suggested_topics
 
     found = describe_bag(path)
@@ -149,7 +153,7 @@ def _describe_bag(path: Path) -> _FileContents:
         if topic.fault:
             (notes if sees or topic.kind not in VIEWS else faults).append(topic.fault)
     if faults:
-        return _FileContents(f"{path}: a bag", None, tuple(rows), tuple(notes), tuple(faults))
+        return Diagnosis(f"{path}: a bag", tuple(rows), tuple(notes), tuple(faults)), np.nan, None
     notes += [
         f"missing: {name}"
         for name in ("views", "truth")
@@ -179,7 +183,8 @@ def _describe_bag(path: Path) -> _FileContents:
         if height < SMALL.rows or width < SMALL.columns:
             size = {"rows": min(height, SMALL.rows), "columns": min(width, SMALL.columns)}
             recording["image"] = size
-    return _FileContents(what, recording, tuple(rows), tuple(notes), tuple(faults), reach, fov)
+    config = {"recording": recording}
+    return Diagnosis(what, tuple(rows), tuple(notes), tuple(faults), config=config), reach, fov
 
 
 def _clock_notes(name: str, clock: Times) -> list[str]:
@@ -198,40 +203,16 @@ def _clock_notes(name: str, clock: Times) -> list[str]:
     return notes
 
 
-def _describe_video(path: Path) -> _FileContents:
+def _describe_video(path: Path) -> _Found:
     from robot.recordings.video import describe_video
 
     frames, rate, width, height = describe_video(path)
     what = f"{path}: a video of {frames} frames, {width} x {height}, {rate:g} a second"
     if not rate > 0:
         fault = "it states no frame rate: set recording.video.rate, or stamps, a CSV file of times"
-        return _FileContents(what, None, faults=(fault,))
+        return Diagnosis(what, faults=(fault,)), np.nan, None
     recording = {"video": {"rate": rate}, "visual_odometry": {"fov_deg": USUAL_FOV}}
-    return _FileContents(what, recording, notes=(NO_WHEELS,))
-
-
-class Diagnosis(NamedTuple):
-    """What was found.
-
-    Attributes:
-        what: one line. table: rows of cells, the first row the heading; may be empty. notes: facts.
-            faults: what prevents a run, or speaks against a map. advice: what to do next.
-            config: sections of a configuration that reads the recording, {} if there is none.
-    """
-
-    what: str
-    table: tuple[tuple[str, ...], ...] = ()
-    notes: tuple[str, ...] = ()
-    faults: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
-    config: dict[str, Any] = {}  # noqa: RUF012
-
-    def render(self) -> str:
-        """The diagnosis as lines of text."""
-        lines = [self.what, *(f"  {line}".rstrip() for line in aligned(self.table))]
-        for mark, texts in (("", self.notes), ("fault: ", self.faults), ("next: ", self.advice)):
-            lines += [f"{mark}{text}" for text in texts]
-        return "\n".join(map(printable, lines))
+    return Diagnosis(what, notes=(NO_WHEELS,), config={"recording": recording}), np.nan, None
 
 
 CELLS_IN_RANGE = 13
@@ -258,24 +239,24 @@ def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
         cure = f"`run {path}` maps what it names, `doctor --live {path}` checks its robot"
         raise InputError(str(path), "a configuration", "a recording or a run directory", cure)
     try:
-        found = _describe_file(path)
+        found, reach, fov = _describe_file(path)
     except InputError:
         if path.is_file() and (diagnosis := _diagnose_registered(path)):
             return diagnosis
         raise
-    if found.recording is None:
+    if not found.config:
         if diagnosis := _diagnose_registered(path):
             return diagnosis
-        return Diagnosis(found.what, found.table, found.notes, found.faults or (UNREADABLE,))
-    sections: dict[str, Any] = {"recording": {"file": str(path.resolve()), **found.recording}}
-    if "visual_odometry" in found.recording:
+        return found._replace(faults=found.faults or (UNREADABLE,))
+    recording = {"file": str(path.resolve()), **found.config["recording"]}
+    sections: dict[str, Any] = {"recording": recording}
+    if "visual_odometry" in recording:
         sections["presets"] = ["visual_odometry"]
     told, faults, step, whiskers = list[str](), found.faults, 0.0, 0
     facts: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
     try:
         if like is not None:
-            fov = found.field_of_view
             sections = _alike(sections if fov is None else sections | {"recall": {"sector_fov": fov}}, like)
         with open_source(validate(parse(dump_data(sections), path.name), RunConfig), told.append) as source:
             facts, advice, step = _summarise(source)
@@ -284,11 +265,10 @@ def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
         faults = (*faults, *str(error).splitlines())
     if like is None and not whiskers:
         # A share of the sensor's range, else the motion between views.
-        known = np.isfinite(found.max_range)
-        size = found.max_range / CELLS_IN_RANGE if known else step or DEFAULT_CELL
+        size = reach / CELLS_IN_RANGE if np.isfinite(reach) else step or DEFAULT_CELL
         sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": float(f"{size:.2g}")}
-        if found.field_of_view is not None:
-            sections["recall"] = {"sector_fov": round(found.field_of_view, 4)}
+        if fov is not None:
+            sections["recall"] = {"sector_fov": round(fov, 4)}
     return Diagnosis(found.what, found.table, (*found.notes, *told, *facts), faults, advice, sections)
 
 

@@ -13,12 +13,14 @@ standard deviations over bootstrap copies of blocks of consecutive windows (Kuen
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import reduce
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ratslam.runs.settings.strict_yaml import dump_data, merge_settings
-from robot.sources.odometry import OdometryCorrection, correct_motions
+from robot.sources.odometry import UNCORRECTED, OdometryCorrection, correct_motions
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.samples import robust_sd
@@ -65,26 +67,10 @@ class WheelFit(NamedTuple):
     @property
     def correction(self) -> OdometryCorrection:
         """The systematic errors beyond `KEPT_SDS`, as settings of a recording."""
-        return OdometryCorrection(
-            length_scale=_if_sure(self.length_scale, 1.0),
-            turn_scale=1.0 if self.turn_scale is None else _if_sure(self.turn_scale, 1.0),
-            heading_bias=_if_sure(self.heading_bias, 0.0),
-        )
-
-
-class _Windows(NamedTuple):
-    """Of each of M windows: way (m), turn and sum of absolute turns (rad) by odometry, true turn, chord by
-    odometry with corrected headings, and true chord (m)."""
-
-    length: np.ndarray
-    turn: np.ndarray
-    turned: np.ndarray
-    true_turn: np.ndarray
-    chord: np.ndarray
-    true_chord: np.ndarray
-
-    def rows(self, rows: np.ndarray) -> _Windows:
-        return _Windows(*(column[rows] for column in self))
+        found = {key: getattr(self, key) for key in ("length_scale", "turn_scale", "heading_bias")}
+        off = {key: pair[0] - getattr(UNCORRECTED, key) for key, pair in found.items() if pair}
+        sure = {key: found[key][0] for key in off if abs(off[key]) > KEPT_SDS * found[key][1]}
+        return OdometryCorrection(**sure)
 
 
 def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: int = 0) -> WheelFit:
@@ -102,42 +88,34 @@ def fit_wheels(time: np.ndarray, motion: np.ndarray, truth: np.ndarray, seed: in
         if not starts or time[row] - time[starts[-1]] >= WINDOW:
             starts.append(row)
     ends = np.array(starts, int)
-    windows = _measure(motion, truth, ends, OdometryCorrection())
-    path, turned = float(windows.length.sum()), float(windows.turned.sum())
+    windows = _measure(motion, truth, ends, UNCORRECTED)
+    path, turned = float(windows[0].sum()), float(windows[2].sum())
     if len(ends) - 1 < LEAST_WINDOWS or path == 0:
         found = f"{path:.3g} m in {max(len(ends) - 1, 0)} windows of {WINDOW:g} s with true poses"
         raise InputError("wheels", found, f"at least {LEAST_WINDOWS} windows of a robot that moves")
     turns = turned >= LEAST_TURNED
     start = _solve_heading(windows, turns)
     windows = _measure(motion, truth, ends, OdometryCorrection(turn_scale=start[0], heading_bias=start[1]))
-    values, draws = _solve(windows, turns), _bootstrap(windows, turns, seed)
+    values, count = _solve(windows, turns), windows.shape[1]
+    blocks = np.array_split(np.arange(count), min(BLOCKS, count))
+    chosen = stream(seed, "fit.wheels").integers(0, len(blocks), (DRAWS, len(blocks)))
+    copies = (np.concatenate([blocks[k] for k in one]) for one in chosen)  # rows of each bootstrap copy
+    draws = np.array([_solve(windows[:, rows], turns) for rows in copies])
     pairs = [(float(value), float(sd)) for value, sd in zip(values, draws.std(axis=0), strict=True)]
-    heading = windows.true_turn - values[1] * windows.turn - values[2] * windows.length
-    chord = windows.true_chord - values[0] * windows.chord
-    slips = np.any([np.abs(error) > SLIP * robust_sd(error) for error in (heading, chord)], axis=0)
-    return WheelFit(
-        length_scale=pairs[0],
-        turn_scale=pairs[1] if turns else None,
-        heading_bias=pairs[2],
-        heading_noise=pairs[3],
-        turn_noise=pairs[4],
-        length_noise=pairs[5],
-        position_noise=pairs[6],
-        windows=len(windows.length),
-        slips=int(slips.sum()),
-        path=path,
-        turned=turned,
-    )
-
-
-def _if_sure(found: tuple[float, float], assumed: float) -> float:
-    return found[0] if abs(found[0] - assumed) > KEPT_SDS * found[1] else assumed
+    length, turn, _, true_turn, chord, true_chord = windows
+    off = true_turn - values[1] * turn - values[2] * length, true_chord - values[0] * chord
+    slips = np.any([np.abs(error) > SLIP * robust_sd(error) for error in off], axis=0)
+    scale, turn_scale, bias, heading_noise, turn_noise, length_noise, position_noise = pairs
+    noises = heading_noise, turn_noise, length_noise, position_noise
+    known = turn_scale if turns else None
+    return WheelFit(scale, known, bias, *noises, len(length), int(slips.sum()), path, turned)
 
 
 def _measure(
     motion: np.ndarray, truth: np.ndarray, ends: np.ndarray, correction: OdometryCorrection
-) -> _Windows:
-    """The windows between these rows."""
+) -> np.ndarray:
+    """[6, M] of each of the windows between these rows: way (m), turn and sum of absolute turns (rad) by
+    odometry, true turn, chord by odometry with corrected headings, and true chord (m)."""
     raw = motion[:, :3]
     sums = np.cumsum(np.column_stack([np.hypot(raw[:, 0], raw[:, 1]), raw[:, 2], np.abs(raw[:, 2])]), axis=0)
     length, turn, turned = np.diff(sums[ends], axis=0).T
@@ -148,31 +126,31 @@ def _measure(
     true_sum = np.concatenate([[0.0], np.cumsum(steps)])[np.searchsorted(known, ends)]
     path = integrate(correct_motions(correction, raw))[ends, :2]
     chord, true_chord = (np.hypot(*np.diff(place, axis=0).T) for place in (path, truth[ends, :2]))
-    return _Windows(length, turn, turned, np.diff(true_sum), chord, true_chord)
+    return np.stack([length, turn, turned, np.diff(true_sum), chord, true_chord])
 
 
-def _solve(windows: _Windows, turns: bool) -> np.ndarray:
+def _solve(windows: np.ndarray, turns: bool) -> np.ndarray:
     """[7] length scale, turn scale, heading bias, and the noises in the order of `WheelFit`."""
     from scipy.optimize import nnls  # slow to import
 
+    length, turn, turned, true_turn, chord, true_chord = windows
     turn_scale, bias = _solve_heading(windows, turns)
-    (scale,) = _solve_robustly(windows.chord[:, None], windows.true_chord)
-    square = _clip_slips(windows.true_turn - turn_scale * windows.turn - bias * windows.length) ** 2
-    per_metre, per_radian = nnls(np.column_stack([windows.length, windows.turned]), square)[0]
-    off = _clip_slips(windows.true_chord - scale * windows.chord)
-    moved = windows.length.sum()
-    share = np.sqrt((off**2).sum() / (windows.chord**2).sum())
+    (scale,) = _solve_robustly(chord[:, None], true_chord)
+    square = _clip_slips(true_turn - turn_scale * turn - bias * length) ** 2
+    per_metre, per_radian = nnls(np.column_stack([length, turned]), square)[0]
+    off = _clip_slips(true_chord - scale * chord)
+    share = np.sqrt((off**2).sum() / (chord**2).sum())
     noises = np.sqrt([per_metre, per_radian]).tolist()
-    return np.array([scale, turn_scale, bias, *noises, share, np.sqrt((off**2).sum() / moved)])
+    return np.array([scale, turn_scale, bias, *noises, share, np.sqrt((off**2).sum() / length.sum())])
 
 
-def _solve_heading(windows: _Windows, turns: bool) -> tuple[float, float]:
+def _solve_heading(windows: np.ndarray, turns: bool) -> tuple[float, float]:
     """Turn scale and heading bias; without turns the scale stays 1."""
+    length, turn, _, true_turn, *_ = windows
     if turns:
-        columns = np.column_stack([windows.turn, windows.length])
-        scale, bias = _solve_robustly(columns, windows.true_turn)
+        scale, bias = _solve_robustly(np.column_stack([turn, length]), true_turn)
         return float(scale), float(bias)
-    (bias,) = _solve_robustly(windows.length[:, None], windows.true_turn - windows.turn)
+    (bias,) = _solve_robustly(length[:, None], true_turn - turn)
     return 1.0, float(bias)
 
 
@@ -188,17 +166,6 @@ def _solve_robustly(columns: np.ndarray, value: np.ndarray) -> np.ndarray:
         lambda x: columns @ x - value, start, jac=lambda x: columns, loss="soft_l1", f_scale=scale
     )
     return fit.x
-
-
-def _bootstrap(windows: _Windows, turns: bool, seed: int) -> np.ndarray:
-    """[DRAWS, 7] fits of copies made of blocks of consecutive windows."""
-    random = stream(seed, "fit.wheels")
-    count = len(windows.length)
-    blocks = np.array_split(np.arange(count), min(BLOCKS, count))
-    draws = []
-    for chosen in random.integers(0, len(blocks), (DRAWS, len(blocks))):
-        draws.append(_solve(windows.rows(np.concatenate([blocks[k] for k in chosen])), turns))
-    return np.array(draws)
 
 
 def _clip_slips(error: np.ndarray) -> np.ndarray:
@@ -249,15 +216,12 @@ class Rig(NamedTuple):
     @classmethod
     def join(cls, rigs: Iterable[Rig]) -> Rig:
         """All parts as one rig."""
-        parts = list(rigs)
-        settings: dict[str, Any] = {}
-        for part in parts:
-            settings = merge_settings(settings, part.settings)
+        quantities, settings, notes, unknown = zip(*rigs, strict=True)
         return cls(
-            tuple(quantity for part in parts for quantity in part.quantities),
-            settings,
-            tuple(note for part in parts for note in part.notes),
-            tuple(reason for part in parts for reason in part.unknown),
+            tuple(chain(*quantities)),
+            reduce(merge_settings, settings, {}),
+            tuple(chain(*notes)),
+            tuple(chain(*unknown)),
         )
 
     def included(self) -> dict[str, Any]:

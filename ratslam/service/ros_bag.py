@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import yaml
@@ -20,7 +20,6 @@ from evaluation.artifacts.grid_files import Nav2Map, read_nav2
 from evaluation.artifacts.manifest import read_manifest
 from evaluation.artifacts.recorded_views import read_whisker_views
 from evaluation.artifacts.run_reader import read_columns, read_run
-from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.metrics.trajectory import align
 from ratslam.runs.build_session import open_observations, read_observations
@@ -30,283 +29,23 @@ from tactile.base.se2 import between, compose, inverse
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
 SECOND = 1_000_000_000
+LAST_SECOND = 2**31 - 1
+"""Largest number of seconds in a ROS 2 stamp."""
 POINTS, LINES = 8, 5
 """Kinds of `visualization_msgs/Marker`: POINTS and LINE_LIST."""
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and yaw in a covariance of six axes
-
-
-class RosMessages:
-    """Builds messages from arrays.
-
-    Raises:
-        InputError: rosbags is not installed.
-    """
-
-    def __init__(self) -> None:
-        try:
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError:
-            cure = "pip install 'ratslam[ros]'"
-            raise InputError("export", "rosbags is not installed", "the extra 'ros'", cure) from None
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
-        self._blanks: dict[str, dict[str, Any]] = {}  # default values of the fields, by type
-
-    def definition(self, name: str) -> str:
-        """The definition of a message type and of all types in it, as MCAP files store it."""
-        return self._store.generate_msgdef(name, ros_version=2)[0]
-
-    def serialize(self, message: Any) -> bytes:
-        """A message as CDR."""
-        return bytes(self._store.serialize_cdr(message, message.__msgtype__))
-
-    def odometry(self, stamp: int, pose: np.ndarray, twist: np.ndarray) -> Any:
-        """nav_msgs/Odometry: pose [3] in odom, twist [3] in base_link, m/s, m/s, rad/s. Covariances are 0,
-        which means unknown."""
-        make = self._make
-        return make(
-            "nav_msgs/msg/Odometry",
-            header=self._header(stamp, ODOM),
-            child_frame_id=BASE,
-            pose=make("geometry_msgs/msg/PoseWithCovariance", pose=self._pose(pose)),
-            twist=make(
-                "geometry_msgs/msg/TwistWithCovariance",
-                twist=make(
-                    "geometry_msgs/msg/Twist",
-                    linear=self._vector(twist[0], twist[1]),
-                    angular=self._vector(0.0, 0.0, twist[2]),
-                ),
-            ),
-        )
-
-    def path(self, stamps: np.ndarray, poses: np.ndarray) -> Any:
-        """nav_msgs/Path of poses [N, 3] in map; its own stamp is that of the first."""
-        stamped = [
-            self._make("geometry_msgs/msg/PoseStamped", header=self._header(s, MAP), pose=self._pose(pose))
-            for s, pose in zip(stamps.tolist(), poses, strict=True)
-        ]
-        return self._make("nav_msgs/msg/Path", header=self._header(int(stamps[0]), MAP), poses=stamped)
-
-    def pose(self, stamp: int, pose: np.ndarray, spread: np.ndarray) -> Any:
-        """geometry_msgs/PoseWithCovarianceStamped in map, from standard deviations [3]: m, m, rad."""
-        covariance = np.zeros((6, 6))
-        covariance[_PLANAR] = np.diag(np.asarray(spread) ** 2)
-        inner = self._make(
-            "geometry_msgs/msg/PoseWithCovariance", pose=self._pose(pose), covariance=covariance.ravel()
-        )
-        name = "geometry_msgs/msg/PoseWithCovarianceStamped"
-        return self._make(name, header=self._header(stamp, MAP), pose=inner)
-
-    def transforms(self, stamp: int, map_to_odom: np.ndarray, odom_to_base: np.ndarray) -> Any:
-        """tf2_msgs/TFMessage with the poses [3] of odom in map and of base_link in odom."""
-        pairs = ((MAP, ODOM, map_to_odom), (ODOM, BASE, odom_to_base))
-        stamped = [
-            self._make(
-                "geometry_msgs/msg/TransformStamped",
-                header=self._header(stamp, parent),
-                child_frame_id=child,
-                transform=self._make(
-                    "geometry_msgs/msg/Transform",
-                    translation=self._vector(pose[0], pose[1]),
-                    rotation=self._turn(pose[2]),
-                ),
-            )
-            for parent, child, pose in pairs
-        ]
-        return self._make("tf2_msgs/msg/TFMessage", transforms=stamped)
-
-    def grid(self, stamp: int, grid: Nav2Map) -> Any:
-        """nav_msgs/OccupancyGrid in map: 0 free, 100 occupied, -1 unknown, as nav2's map_server publishes."""
-        height, width = grid.cell.shape
-        info = self._make(
-            "nav_msgs/msg/MapMetaData",
-            map_load_time=self._time(stamp),
-            resolution=grid.resolution,
-            width=width,
-            height=height,
-            origin=self._pose(grid.origin),
-        )
-        cells = grid.cell.astype(np.int8).ravel()
-        return self._make(
-            "nav_msgs/msg/OccupancyGrid", header=self._header(stamp, MAP), info=info, data=cells
-        )
-
-    def image(self, stamp: int, pixels: np.ndarray) -> Any:
-        """sensor_msgs/Image of [R, C, K] uint8: colours for three channels, else the first one in grey."""
-        colour = pixels.shape[2] == 3
-        shown = np.ascontiguousarray(pixels if colour else pixels[..., :1])
-        height, width, channels = shown.shape
-        return self._make(
-            "sensor_msgs/msg/Image",
-            header=self._header(stamp, BASE),
-            height=height,
-            width=width,
-            encoding="rgb8" if colour else "mono8",
-            step=width * channels,
-            data=shown.ravel(),
-        )
-
-    def marker(
-        self, stamp: int, name: str, kind: int, points: np.ndarray, colour: tuple[float, ...], width: float
-    ) -> Any:
-        """visualization_msgs/Marker of points [n, 2] in map: `POINTS`, or `LINES` between pairs of points.
-
-        Args:
-            name: namespace of the marker. colour: red, green, blue, opacity in 0..1. width: m.
-        """
-        make = self._make
-        return make(
-            "visualization_msgs/msg/Marker",
-            header=self._header(stamp, MAP),
-            ns=name,
-            type=kind,
-            pose=self._pose(np.zeros(3)),
-            scale=self._vector(width, width),
-            color=make("std_msgs/msg/ColorRGBA", **dict(zip("rgba", colour, strict=True))),
-            points=[make("geometry_msgs/msg/Point", x=x, y=y) for x, y in points.tolist()],
-        )
-
-    def markers(self, parts: list[Any]) -> Any:
-        """visualization_msgs/MarkerArray."""
-        return self._make("visualization_msgs/msg/MarkerArray", markers=parts)
-
-    def _time(self, stamp: int) -> Any:
-        seconds, rest = divmod(int(stamp), SECOND)
-        return self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
-
-    def _header(self, stamp: int, frame: str) -> Any:
-        return self._make("std_msgs/msg/Header", stamp=self._time(stamp), frame_id=frame)
-
-    def _vector(self, x: float, y: float, z: float = 0.0) -> Any:
-        return self._make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
-
-    def _turn(self, heading: float) -> Any:
-        half = float(heading) / 2
-        return self._make("geometry_msgs/msg/Quaternion", z=float(np.sin(half)), w=float(np.cos(half)))
-
-    def _pose(self, pose: np.ndarray) -> Any:
-        place = self._make("geometry_msgs/msg/Point", x=float(pose[0]), y=float(pose[1]))
-        return self._make("geometry_msgs/msg/Pose", position=place, orientation=self._turn(pose[2]))
-
-    def _make(self, name: str, **given: Any) -> Any:
-        """A message with the given fields; numbers, texts and lists that are not given are 0 or empty."""
-        if name not in self._blanks:
-            fields = self._store.fielddefs[name][1]
-            self._blanks[name] = {field: self._default(description) for field, description in fields}
-        blank = self._blanks[name]
-        return self._store.types[name](**{field: given.get(field, blank[field]) for field in blank})
-
-    def _default(self, description: Any) -> Any:
-        from rosbags.interfaces import Nodetype
-
-        kind, inner = description
-        if kind == Nodetype.BASE:
-            return {"string": "", "bool": False}.get(inner[0], 0)
-        if kind == Nodetype.NAME:
-            return self._make(inner)
-        (element, detail), length = inner
-        if element == Nodetype.BASE and detail[0] != "string":
-            return np.zeros(length if kind == Nodetype.ARRAY else 0, detail[0])
-        return []
-
-
-LAST_SECOND = 2**31 - 1
-"""Largest number of seconds in a ROS 2 stamp."""
-
-
-class _ExportedRun(NamedTuple):
-    """A run of N steps; poses are in the frame of the map unless stated otherwise.
-
-    Attributes:
-        stamps: [N] int64, ns, the times of the recording. run: its arrays, pieces of the map where
-            plots show them.
-        spread: [N, 3] standard deviations of the online pose, m, m, rad.
-        truth: [N, 3] true poses brought nearest to the final trajectory by one rigid motion, NaN in rows
-            without one; or None.
-        candidates: [n, 2] earlier and later step of each candidate for a loop closure. verdicts: of each.
-        grid: the occupancy map, or None. images: yields (step, [R, C, K] uint8) of each view that was seen.
-    """
-
-    stamps: np.ndarray
-    run: RunArrays
-    spread: np.ndarray
-    truth: np.ndarray | None
-    candidates: np.ndarray
-    verdicts: list[str]
-    grid: Nav2Map | None
-    images: Callable[[], Iterator[tuple[int, np.ndarray]]]
-
-
-def read_exported_run(directory: Path, warn: Callable[[str], None]) -> _ExportedRun:
-    """Reads a run directory, also the incomplete one of an interrupted run.
-
-    Args:
-        warn: called with a sentence if the views cannot be read.
-
-    Raises:
-        InputError: a file is missing or malformed, or a time does not fit into a ROS 2 stamp.
-    """
-    run = arrange_pieces(read_run(directory))
-    steps, truth = len(run.time), None
-    found = read_columns(directory / "steps.csv", "sd_x", "sd_y", "sd_heading")
-    columns = [column[:steps] for column in found]
-    closures = read_closure_table(directory)
-    known = np.flatnonzero(((closures.steps >= 0) & (closures.steps < steps)).all(axis=1))
-    bad = ~((run.time >= 0) & (run.time <= LAST_SECOND))
-    if bad.any():
-        expected = f"0 to {LAST_SECOND} s, the range of ROS 2 stamps"
-        raise InputError(str(directory / "online.tum"), f"a time of {run.time[bad][0]:g} s", expected)
-    if run.truth is not None:
-        there = np.isfinite(run.truth).all(axis=1)
-        truth = np.full_like(run.truth, np.nan)
-        truth[there] = compose(inverse(align(run.final[there], run.truth[there])), run.truth[there])
-    return _ExportedRun(
-        stamps=np.rint(run.time * 1e9).astype(np.int64),
-        run=run,
-        spread=np.stack(columns, axis=1),
-        truth=truth,
-        candidates=closures.steps[known],
-        verdicts=[closures.verdicts[k] for k in known],
-        grid=read_nav2(directory / "map.yaml") if (directory / "map.yaml").exists() else None,
-        images=lambda: _images(directory, run.time, warn),
-    )
-
-
-def _images(
-    directory: Path, time: np.ndarray, warn: Callable[[str], None]
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Whisker images of the run directory, or the views of its recording if that is still there; none for a
-    simulation, which would have to be repeated."""
-    if (directory / "views.npz").exists():
-        views = read_whisker_views(directory / "views.npz").view
-        yield from enumerate(_pixels(view[..., None]) for view in views[: len(time)])
-        return
-    try:
-        config = load_config(directory / "config.yaml")
-        if config.recording is None:
-            return
-        digest = read_manifest(directory).digest
-        with open_observations(config) as (_, source):
-            if source.digest != digest:
-                cure = "the views are those of another recording"
-                raise InputError(source.name, "changed since the run", "the recording of the run", cure)
-            step = 0
-            for sample, observation in read_observations(source):
-                if step == len(time):
-                    return
-                if sample.time != time[step]:  # a continued run starts later in its recording
-                    continue
-                if observation.view_seen and observation.view.size:
-                    yield step, _pixels(observation.view)
-                step += 1
-    except InputError as error:
-        warn(f"the file has no views: {error}")
-
-
-def _pixels(view: np.ndarray) -> np.ndarray:
-    """A view in 0..1 as 8-bit pixels."""
-    return np.rint(255 * np.clip(view, 0.0, 1.0)).astype(np.uint8)
-
-
+KINDS = {
+    "/path/map": "nav_msgs/msg/Path",
+    "/path/odometry": "nav_msgs/msg/Path",
+    "/path/truth": "nav_msgs/msg/Path",
+    "/map": "nav_msgs/msg/OccupancyGrid",
+    "/markers": "visualization_msgs/msg/MarkerArray",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "/view": "sensor_msgs/msg/Image",
+}
+"""Topics and their types of messages."""
 GREY, GREEN, ORANGE, RED = (
     (0.5, 0.5, 0.5, 0.6),
     (0.1, 0.6, 0.2, 0.9),
@@ -320,122 +59,311 @@ THIN, THICK = 0.1, 0.3
 LATCHED = ("/path/map", "/path/odometry", "/path/truth", "/map", "/markers")
 """Topics with one message, at the first stamp: late subscribers get it too."""
 
-
-def _messages(exported: _ExportedRun, ros: RosMessages) -> Iterator[tuple[str, int, Any]]:
-    """All messages of a run in order of time, each with its topic and its stamp in ns."""
-    first = int(exported.stamps[0])
-    for topic, message in _latched_messages(exported, ros, first):
-        yield (topic, first, message)
-    run = exported.run
-    images = exported.images()
-    image = next(images, None)
-    start = inverse(run.odometry[0])  # so that odom and map agree at the first step
-    odometry = compose(compose(run.online[0], start), run.odometry)
-    twist = np.zeros_like(odometry)  # mean velocity of each step in its own frame; 0 without a duration
-    duration = np.diff(run.time)[:, None]
-    np.divide(between(odometry[:-1], odometry[1:]), duration, out=twist[1:], where=duration > 0)
-    offset = compose(run.online, inverse(odometry))
-    for step, stamp in enumerate(exported.stamps.tolist()):
-        yield ("/tf", stamp, ros.transforms(stamp, offset[step], odometry[step]))
-        yield ("/odom", stamp, ros.odometry(stamp, odometry[step], twist[step]))
-        yield ("/pose", stamp, ros.pose(stamp, run.online[step], exported.spread[step]))
-        if image is not None and image[0] == step:
-            yield ("/view", stamp, ros.image(stamp, image[1]))
-            image = next(images, None)
+Fields = dict[str, Any]
+"""Fields of a message; those of messages in it are nested. What is not given is 0 or empty."""
 
 
-def _latched_messages(exported: _ExportedRun, ros: RosMessages, first: int) -> Iterator[tuple[str, Any]]:
-    run, stamps = exported.run, exported.stamps
-    yield "/path/map", ros.path(stamps, run.final)
-    own = compose(inverse(run.odometry[0]), run.odometry)
-    yield "/path/odometry", ros.path(stamps, compose(run.online[0], own))
-    if exported.truth is not None:
-        known = np.isfinite(exported.truth).all(axis=1)
-        yield "/path/truth", ros.path(stamps[known], exported.truth[known])
-    if exported.grid is not None:
-        yield "/map", ros.grid(first, exported.grid)
-    if markers := _markers(exported, ros, first):
-        yield "/markers", ros.markers(markers)
+class RosRun:
+    """The messages of a run of N steps, also of the incomplete one of an interrupted run.
 
+    Args:
+        directory: of the run. warn: called with a sentence if the views cannot be read.
 
-def _markers(exported: _ExportedRun, ros: RosMessages, stamp: int) -> list[Any]:
-    """Experiences and their links, and the candidates for loop closures by verdict."""
-    run, parts = exported.run, []
-    nodes, links = run.nodes[:, :2], run.links
-    between_nodes = np.hypot(*(nodes[links[:, 0]] - nodes[links[:, 1]]).T) if len(links) else np.zeros(0)
-    size = float(np.median(between_nodes)) if len(links) else 0.1
-    if len(nodes):
-        parts.append(ros.marker(stamp, "graph/experiences", POINTS, nodes, GREY, THICK * size))
-    if len(links):
-        parts.append(ros.marker(stamp, "graph/links", LINES, nodes[links].reshape(-1, 2), GREY, THIN * size))
-    for verdict, colour in VERDICTS.items():
-        chosen = exported.candidates[np.array(exported.verdicts, dtype=str) == verdict]
-        if len(chosen):
-            ends = run.final[chosen, :2].reshape(-1, 2)
-            parts.append(ros.marker(stamp, f"closures/{verdict}", LINES, ends, colour, THIN * size))
-    return parts
+    Attributes:
+        run: its arrays, pieces of the map where plots show them.
 
-
-def write_mcap(path: Path, exported: _ExportedRun, ros: RosMessages) -> dict[str, tuple[str, int]]:
-    """Writes an MCAP file with the ROS 2 profile; equal runs give equal bytes.
-
-    Returns:
-        its topics, each with its message type and the number of its messages.
+    Raises:
+        InputError: rosbags is not installed, a file is missing or malformed, or a time does not fit into a
+            ROS 2 stamp.
     """
-    kinds: dict[str, str] = {}
-    channels: dict[str, int] = {}
-    counts: dict[str, int] = {}
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start(profile="ros2", library="ratslam")
-        schemas: dict[str, int] = {}
-        for topic, stamp, message in _messages(exported, ros):
-            if topic not in channels:
-                kind = message.__msgtype__
-                if kind not in schemas:
-                    schemas[kind] = writer.register_schema(kind, "ros2msg", ros.definition(kind).encode())
-                profile = {"offered_qos_profiles": _quality_of_service(topic)}
-                channels[topic] = writer.register_channel(topic, "cdr", schemas[kind], profile)
-                kinds[topic], counts[topic] = kind, 0
-            writer.add_message(channels[topic], stamp, ros.serialize(message), stamp, counts[topic])
-            counts[topic] += 1
-        writer.finish()
-    return {topic: (kind, counts[topic]) for topic, kind in kinds.items()}
+
+    def __init__(self, directory: Path, warn: Callable[[str], None]) -> None:
+        try:
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError:
+            cure = "pip install 'ratslam[ros]'"
+            raise InputError("export", "rosbags is not installed", "the extra 'ros'", cure) from None
+        self._store: Any = get_typestore(Stores.ROS2_HUMBLE)
+        self._directory, self._warn = directory, warn
+        self.run = run = arrange_pieces(read_run(directory))
+        bad = ~((run.time >= 0) & (run.time <= LAST_SECOND))
+        if bad.any():
+            expected = f"0 to {LAST_SECOND} s, the range of ROS 2 stamps"
+            raise InputError(str(directory / "online.tum"), f"a time of {run.time[bad][0]:g} s", expected)
+        self._stamps = np.rint(run.time * 1e9).astype(np.int64)  # ns, the times of the recording
+        columns = read_columns(directory / "steps.csv", "sd_x", "sd_y", "sd_heading")
+        self._spread = np.stack([column[: len(run.time)] for column in columns], axis=1)  # [N, 3] m, m, rad
+        self._closures = read_closure_table(directory)
+        self._grid = read_nav2(directory / "map.yaml") if (directory / "map.yaml").exists() else None
+
+    def _messages(self) -> Iterator[tuple[str, int, Fields]]:
+        """All messages in order of time, each with its topic and its stamp in ns."""
+        run = self.run
+        for topic, message in self._latched_messages():
+            yield topic, int(self._stamps[0]), message
+        images = self._images()
+        image = next(images, None)
+        start = inverse(run.odometry[0])  # so that odom and map agree at the first step
+        odometry = compose(compose(run.online[0], start), run.odometry)
+        twist = np.zeros_like(odometry)  # mean velocity of each step in its own frame; 0 without a duration
+        duration = np.diff(run.time)[:, None]
+        np.divide(between(odometry[:-1], odometry[1:]), duration, out=twist[1:], where=duration > 0)
+        offset = compose(run.online, inverse(odometry))
+        for step, stamp in enumerate(self._stamps.tolist()):
+            yield "/tf", stamp, _transforms(stamp, offset[step], odometry[step])
+            velocity = {"linear": _vector(*twist[step, :2]), "angular": _vector(0.0, 0.0, twist[step, 2])}
+            moving = {"pose": {"pose": _pose(odometry[step])}, "twist": {"twist": velocity}}
+            # Covariances of 0: unknown.
+            yield "/odom", stamp, {"header": _header(stamp, ODOM), "child_frame_id": BASE, **moving}
+            covariance = np.zeros((6, 6))
+            covariance[_PLANAR] = np.diag(self._spread[step] ** 2)
+            online = {"pose": _pose(run.online[step]), "covariance": covariance.ravel()}
+            yield "/pose", stamp, {"header": _header(stamp, MAP), "pose": online}
+            if image is not None and image[0] == step:
+                yield "/view", stamp, _image(stamp, image[1])
+                image = next(images, None)
+
+    def _latched_messages(self) -> Iterator[tuple[str, Fields]]:
+        run, stamps = self.run, self._stamps
+        yield "/path/map", _path(stamps, run.final)
+        own = compose(inverse(run.odometry[0]), run.odometry)
+        yield "/path/odometry", _path(stamps, compose(run.online[0], own))
+        if run.truth is not None:
+            known = np.isfinite(run.truth).all(axis=1)
+            # Brought nearest to the final trajectory by one rigid motion.
+            aligned = compose(inverse(align(run.final[known], run.truth[known])), run.truth[known])
+            yield "/path/truth", _path(stamps[known], aligned)
+        if self._grid is not None:
+            yield "/map", _occupancy(int(stamps[0]), self._grid)
+        if markers := self._markers(int(stamps[0])):
+            yield "/markers", {"markers": markers}
+
+    def _markers(self, stamp: int) -> list[Fields]:
+        """Experiences and their links, and the candidates for loop closures by verdict."""
+        run, parts = self.run, []
+        nodes, links = run.nodes[:, :2], run.links
+        between_nodes = np.hypot(*(nodes[links[:, 0]] - nodes[links[:, 1]]).T) if len(links) else np.zeros(0)
+        size = float(np.median(between_nodes)) if len(links) else 0.1
+        if len(nodes):
+            parts.append(_marker(stamp, "graph/experiences", POINTS, nodes, GREY, THICK * size))
+        if len(links):
+            ends = nodes[links].reshape(-1, 2)
+            parts.append(_marker(stamp, "graph/links", LINES, ends, GREY, THIN * size))
+        steps, verdicts = self._closures.steps, np.array(self._closures.verdicts, dtype=str)
+        known = ((steps >= 0) & (steps < len(run.time))).all(axis=1)
+        for verdict, colour in VERDICTS.items():
+            chosen = steps[known & (verdicts == verdict)]
+            if len(chosen):
+                ends = run.final[chosen, :2].reshape(-1, 2)
+                parts.append(_marker(stamp, f"closures/{verdict}", LINES, ends, colour, THIN * size))
+        return parts
+
+    def _images(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Whisker images of the run directory, or the views of its recording if that is still there, each
+        with its step; none for a simulation, which would have to be repeated."""
+        if (self._directory / "views.npz").exists():
+            views = read_whisker_views(self._directory / "views.npz").view
+            yield from enumerate(_pixels(view[..., None]) for view in views[: len(self.run.time)])
+            return
+        try:
+            config = load_config(self._directory / "config.yaml")
+            if config.recording is None:
+                return
+            digest = read_manifest(self._directory).digest
+            with open_observations(config) as (_, source):
+                if source.digest != digest:
+                    cure = "the views are those of another recording"
+                    raise InputError(source.name, "changed since the run", "the recording of the run", cure)
+                step = 0
+                for sample, observation in read_observations(source):
+                    if step == len(self.run.time):
+                        return
+                    if sample.time != self.run.time[step]:  # a continued run starts later in its recording
+                        continue
+                    if observation.view_seen and observation.view.size:
+                        yield step, _pixels(observation.view)
+                    step += 1
+        except InputError as error:
+            self._warn(f"the file has no views: {error}")
+
+    def write_mcap(self, path: Path) -> dict[str, int]:
+        """Writes an MCAP file with the ROS 2 profile; equal runs give equal bytes.
+
+        Returns:
+            its topics, each with the number of its messages.
+        """
+        channels: dict[str, int] = {}
+        counts: dict[str, int] = {}
+        with path.open("wb") as file:
+            writer = Writer(file, compression=CompressionType.ZSTD)
+            writer.start(profile="ros2", library="ratslam")
+            schemas: dict[str, int] = {}
+            for topic, stamp, fields in self._messages():
+                kind = KINDS[topic]
+                if topic not in channels:
+                    if kind not in schemas:
+                        text = self._store.generate_msgdef(kind, ros_version=2)[0]  # with all types in it
+                        schemas[kind] = writer.register_schema(kind, "ros2msg", text.encode())
+                    profile = {"offered_qos_profiles": _quality_of_service(topic)}
+                    channels[topic] = writer.register_channel(topic, "cdr", schemas[kind], profile)
+                    counts[topic] = 0
+                data = bytes(self._store.serialize_cdr(self._message(kind, fields), kind))
+                writer.add_message(channels[topic], stamp, data, stamp, counts[topic])
+                counts[topic] += 1
+            writer.finish()
+        return counts
+
+    def write_bag(self, folder: Path, name: str) -> None:
+        """Writes a ROS 2 bag into an existing folder: NAME_0.mcap and metadata.yaml."""
+        file = f"{name}_0.mcap"
+        counts = self.write_mcap(folder / file)
+        first, last = int(self._stamps[0]), int(self._stamps[-1])
+        span = {
+            "duration": {"nanoseconds": last - first},
+            "starting_time": {"nanoseconds_since_epoch": first},
+            "message_count": sum(counts.values()),
+        }
+        information = {
+            "version": 5,
+            "storage_identifier": "mcap",
+            **span,
+            "topics_with_message_count": [
+                {
+                    "topic_metadata": {
+                        "name": topic,
+                        "type": KINDS[topic],
+                        "serialization_format": "cdr",
+                        "offered_qos_profiles": _quality_of_service(topic),
+                    },
+                    "message_count": count,
+                }
+                for topic, count in counts.items()
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [file],
+            "files": [{"path": file, **span}],
+        }
+        text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
+        (folder / "metadata.yaml").write_text(text, encoding="utf-8")
+
+    def _message(self, kind: str, fields: Fields) -> Any:
+        types = self._store.fielddefs[kind][1]
+        made = {name: self._value(form, inner, fields.get(name)) for name, (form, inner) in types}
+        return self._store.types[kind](**made)
+
+    def _value(self, form: Any, inner: Any, given: Any) -> Any:
+        """A value of a message from what is given for it, None for nothing.
+
+        Args:
+            form, inner: the `rosbags.interfaces.Nodetype` of the field, and what it holds.
+        """
+        from rosbags.interfaces import Nodetype
+
+        if form == Nodetype.NAME:
+            return self._message(inner, given or {})
+        if form == Nodetype.BASE:
+            return {"string": "", "bool": False}.get(inner[0], 0) if given is None else given
+        (element, detail), length = inner
+        if element == Nodetype.NAME:
+            return [self._message(detail, fields) for fields in given or ()]
+        if given is None and detail[0] != "string":
+            return np.zeros(length if form == Nodetype.ARRAY else 0, detail[0])
+        return [] if given is None else given
 
 
-def write_bag(folder: Path, name: str, exported: _ExportedRun, ros: RosMessages) -> None:
-    """Writes a ROS 2 bag into an existing folder: NAME_0.mcap and metadata.yaml."""
-    file = f"{name}_0.mcap"
-    topics = write_mcap(folder / file, exported, ros)
-    first, last = int(exported.stamps[0]), int(exported.stamps[-1])
-    span = {
-        "duration": {"nanoseconds": last - first},
-        "starting_time": {"nanoseconds_since_epoch": first},
-        "message_count": sum(count for _, count in topics.values()),
+def _header(stamp: int, frame: str) -> Fields:
+    return {"stamp": _time(stamp), "frame_id": frame}
+
+
+def _time(stamp: int) -> Fields:
+    seconds, rest = divmod(int(stamp), SECOND)
+    return {"sec": seconds, "nanosec": rest}
+
+
+def _vector(x: float, y: float, z: float = 0.0) -> Fields:
+    return {"x": float(x), "y": float(y), "z": float(z)}
+
+
+def _turn(heading: float) -> Fields:
+    half = float(heading) / 2
+    return {"z": float(np.sin(half)), "w": float(np.cos(half))}
+
+
+def _pose(pose: np.ndarray) -> Fields:
+    return {"position": _vector(pose[0], pose[1]), "orientation": _turn(pose[2])}
+
+
+def _path(stamps: np.ndarray, poses: np.ndarray) -> Fields:
+    """nav_msgs/Path of poses [N, 3] in map; its own stamp is that of the first."""
+    pairs = zip(stamps.tolist(), poses, strict=True)
+    stamped = [{"header": _header(stamp, MAP), "pose": _pose(pose)} for stamp, pose in pairs]
+    return {"header": _header(int(stamps[0]), MAP), "poses": stamped}
+
+
+def _transforms(stamp: int, map_to_odom: np.ndarray, odom_to_base: np.ndarray) -> Fields:
+    """tf2_msgs/TFMessage with the poses [3] of odom in map and of base_link in odom."""
+    stamped = [
+        {
+            "header": _header(stamp, parent),
+            "child_frame_id": child,
+            "transform": {"translation": _vector(pose[0], pose[1]), "rotation": _turn(pose[2])},
+        }
+        for parent, child, pose in ((MAP, ODOM, map_to_odom), (ODOM, BASE, odom_to_base))
+    ]
+    return {"transforms": stamped}
+
+
+def _occupancy(stamp: int, grid: Nav2Map) -> Fields:
+    """nav_msgs/OccupancyGrid in map: 0 free, 100 occupied, -1 unknown, as nav2's map_server publishes."""
+    height, width = grid.cell.shape
+    info = {
+        "map_load_time": _time(stamp),
+        "resolution": grid.resolution,
+        "width": width,
+        "height": height,
+        "origin": _pose(grid.origin),
     }
-    information = {
-        "version": 5,
-        "storage_identifier": "mcap",
-        **span,
-        "topics_with_message_count": [
-            {
-                "topic_metadata": {
-                    "name": name,
-                    "type": kind,
-                    "serialization_format": "cdr",
-                    "offered_qos_profiles": _quality_of_service(name),
-                },
-                "message_count": count,
-            }
-            for name, (kind, count) in topics.items()
-        ],
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": [file],
-        "files": [{"path": file, **span}],
+    return {"header": _header(stamp, MAP), "info": info, "data": grid.cell.astype(np.int8).ravel()}
+
+
+def _image(stamp: int, pixels: np.ndarray) -> Fields:
+    """sensor_msgs/Image of [R, C, K] uint8: colours for three channels, else the first one in grey."""
+    colour = pixels.shape[2] == 3
+    shown = np.ascontiguousarray(pixels if colour else pixels[..., :1])
+    height, width, channels = shown.shape
+    return {
+        "header": _header(stamp, BASE),
+        "height": height,
+        "width": width,
+        "encoding": "rgb8" if colour else "mono8",
+        "step": width * channels,
+        "data": shown.ravel(),
     }
-    text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
-    (folder / "metadata.yaml").write_text(text, encoding="utf-8")
+
+
+def _marker(
+    stamp: int, name: str, kind: int, points: np.ndarray, colour: tuple[float, ...], width: float
+) -> Fields:
+    """visualization_msgs/Marker of points [n, 2] in map: `POINTS`, or `LINES` between pairs of points.
+
+    Args:
+        name: namespace of the marker. colour: red, green, blue, opacity in 0..1. width: m.
+    """
+    return {
+        "header": _header(stamp, MAP),
+        "ns": name,
+        "type": kind,
+        "pose": _pose(np.zeros(3)),
+        "scale": _vector(width, width),
+        "color": dict(zip("rgba", colour, strict=True)),
+        "points": [{"x": x, "y": y} for x, y in points.tolist()],
+    }
+
+
+def _pixels(view: np.ndarray) -> np.ndarray:
+    """A view in 0..1 as 8-bit pixels."""
+    return np.rint(255 * np.clip(view, 0.0, 1.0)).astype(np.uint8)
 
 
 def _quality_of_service(topic: str) -> str:

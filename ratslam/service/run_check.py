@@ -20,7 +20,7 @@ from ratslam.mapping.pose_graph import read_json
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.service.recording_check import Diagnosis
 from robot.live.polling import SessionFault
-from robot.live.selftest import check_arm_session, check_create
+from robot.live.selftest import check_session
 from tactile.base.bounded import read_rows
 from tactile.base.errors import InputError
 from tactile.base.se2 import between
@@ -126,9 +126,8 @@ def _settings_to_try(run: RunArrays, config: RunConfig, closures: Closures | Non
     if closures is not None and not closures.accepted:
         advice.append(NONE_ACCEPTED if closures.proposed else NONE_PROPOSED)
     elif run.doubt > CAUTION:
-        advice.append(
-            "python -m ratslam report RUN_DIR -o report.html: shows each closure with its two views"
-        )
+        report = "python -m ratslam report RUN_DIR -o report.html"
+        advice.append(f"{report}: shows each closure with its two views")
         if config.recall.sector_fov == "auto":
             advice.append("recall.sector_fov: the sensor's field of view, rad, instead of an estimate")
         advice.append("keyframes.noise: the noise of this robot's odometry, instead of the preset's")
@@ -150,11 +149,7 @@ def diagnose_live(config: RunConfig, name: str, directory: Path) -> Diagnosis:
     robot = "an arm" if live.create is None else "a Create"
     passed = [f"settings: backend {config.backend}, {robot}"]
     try:
-        if live.create is not None:
-            lines = check_create(live, directory)
-        else:
-            lines = check_arm_session(live, config.touch.head, directory)
-        for line in lines:
+        for line in check_session(live, config.touch.head, directory):
             passed.append(line)  # those before a failure count
     except (InputError, SessionFault) as error:
         return Diagnosis(f"{name}: the live session cannot start", (), tuple(passed), (str(error),))

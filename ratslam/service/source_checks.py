@@ -1,6 +1,7 @@
-"""Conformance checks of a source: its attributes, its samples, and that they can be read again.
+"""Conformance checks of a source and of a touch front end.
 
-`require_shapes` and `require_masked` serve the checks of front ends too.
+Of a source: its attributes, its samples, and that they can be read again. Of a front end, on the readings
+of a source: shapes, masks, motion, no memory.
 """
 
 from __future__ import annotations
@@ -16,27 +17,41 @@ import numpy as np
 
 from ratslam.service.check_results import (
     Result,
+    Trial,
     Violation,
     check,
-    checks_of,
+    find_parts,
     leaves,
-    read_assignments,
     require,
     require_equal,
-    require_settings_class,
-    run_checks,
 )
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.source import SOURCES, ClosedSource, Sample, Source, SourceEntry, SourceInfo, rate_of
-from robot.touch_source import TOUCH, head_config_of, open_touch_source, report_config_of
+from robot.touch_source import (
+    TOUCH,
+    ReadingProcessor,
+    TouchEntry,
+    head_config_of,
+    open_touch_source,
+    report_config_of,
+)
 from tactile.base.errors import InputError
-from tactile.base.plugins import PluginConfig
+from tactile.base.plugins import NoSettings, PluginConfig
+from tactile.base.se2 import compose
 from tactile.base.types import Observation
 from tactile.frontend import TouchConfig
+from tactile.whisker_geometry import HeadConfig
 
 SAMPLES = 4096
 """Samples of a source that are examined unless said otherwise."""
+READINGS = 256
+"""Readings that are examined."""
+MOTION_TOLERANCE = 1e-6
+"""Difference allowed between motions, m, rad and s: front ends may round."""
+ATTRIBUTES = ("name", "rate_hz", "view_shape", "whiskers", "length", "digest", "info")
+METHODS = ("__iter__", "__enter__", "__exit__")
 OPENED, READ, OBSERVED = range(3)
-"""Groups of checks, in their order."""
+"""Groups of checks, in their order: of what is opened or built, of what is read, of what is made of it."""
 
 
 class Reading(NamedTuple):
@@ -72,18 +87,18 @@ class Reading(NamedTuple):
         return cls(samples, copies, again, complete, suppresses)
 
 
-class SourceTrial:
+class SourceTrial(Trial[SourceEntry]):
     """A source with settings: what its checks share, and the checks.
 
     Args:
-        settings: an instance of the entry's `config_class`. frontend: for readings that are not observations.
-        most: samples to examine.
+        frontend: for readings that are not observations. most: samples to examine.
     """
 
     def __init__(
         self, entry: SourceEntry, settings: Any, frontend: PluginConfig | None = None, most: int = SAMPLES
     ) -> None:
-        self.entry, self.settings, self.frontend, self.most = entry, settings, frontend, most
+        super().__init__(entry, settings)
+        self.frontend, self.most = frontend, most
 
     @cached_property
     def source(self) -> Source:
@@ -122,7 +137,7 @@ class SourceTrial:
     @check(OPENED, "the entry is complete", "a configuration names it with its settings")
     def entry_is_complete(self) -> str:
         entry = self.entry
-        require_settings_class(entry.config_class)
+        super().entry_is_complete.run(self)
         for suffix in entry.suffixes:
             sound = suffix.startswith(".") and suffix == suffix.lower()
             require(sound, f"suffix {suffix!r}", "a lower-case suffix such as '.bag'")
@@ -143,9 +158,8 @@ class SourceTrial:
         require(sound, f"view_shape {shape!r}", "a tuple of three sizes (R, C, K)")
         require(_is_count(source.whiskers), f"whiskers {source.whiskers!r}", "a number from 0")
         require(length is None or _is_count(length), f"length {length!r}", "a number of samples, or None")
-        require(
-            isinstance(source.digest, str), f"digest {source.digest!r}", "sha256 (hex), '' for a live robot"
-        )
+        sound = isinstance(source.digest, str)
+        require(sound, f"digest {source.digest!r}", "sha256 (hex), '' for a live robot")
         require(isinstance(source.info, SourceInfo), f"info {type(source.info).__name__}", "SourceInfo")
         source.info.to_json()
         return f"view_shape {shape}, {source.whiskers} whiskers"
@@ -161,9 +175,8 @@ class SourceTrial:
 
     @check(OBSERVED, "it closes without hiding errors", "a run that fails would look complete")
     def closes(self) -> None:
-        require(
-            not self.reading.suppresses, "__exit__ returned a true value", "None: errors must get through"
-        )
+        found = "__exit__ returned a true value"
+        require(not self.reading.suppresses, found, "None: errors must get through")
 
     @check(OBSERVED, "times never decrease", "trajectories are matched with truth by time")
     def times_increase(self) -> None:
@@ -174,20 +187,19 @@ class SourceTrial:
         back = np.flatnonzero(np.diff(np.array(times, float)) < 0)
         if len(back):
             k = int(back[0])
-            raise Violation(
-                f"time {times[k + 1]} of sample {k + 1} after {times[k]}", "times that never decrease"
-            )
+            found = f"time {times[k + 1]} of sample {k + 1} after {times[k]}"
+            raise Violation(found, "times that never decrease")
 
     @check(OBSERVED, "observations have the declared shapes", "the kernel is compiled for them")
     def views_have_shapes(self) -> None:
         source = self.observing
         for k, observation in enumerate(self.observations):
-            require_shapes(observation, source.view_shape, source.whiskers, f"observation {k}")
+            _require_shapes(observation, source.view_shape, source.whiskers, f"observation {k}")
 
     @check(OBSERVED, "absent values are masked, not NaN", "one NaN spoils a step")
     def masks_values(self) -> None:
         for k, observation in enumerate(self.observations):
-            require_masked(observation, f"observation {k}", self.observing.info.signed_views)
+            _require_masked(observation, f"observation {k}", self.observing.info.signed_views)
 
     @check(OBSERVED, "truth is [3] or None", "scores are computed from it")
     def truth_is_pose(self) -> str:
@@ -195,9 +207,8 @@ class SourceTrial:
         for k, sample in enumerate(self.reading.samples):
             if sample.truth is not None:
                 truth, known = sample.truth, known + 1
-                sound = (
-                    isinstance(truth, np.ndarray) and truth.shape == (3,) and bool(np.isfinite(truth).all())
-                )
+                sound = isinstance(truth, np.ndarray) and truth.shape == (3,)
+                sound = sound and bool(np.isfinite(truth).all())
                 require(sound, f"truth {truth!r} of sample {k}", "an array [3] of finite numbers, or None")
         return f"known in {known} of {len(self.reading.samples)} samples"
 
@@ -218,9 +229,8 @@ class SourceTrial:
         found = rate_of(np.array([sample.time for sample in self.reading.samples], float))
         if rate == 0 or found == 0:
             return "not known"
-        require(
-            found / 2 <= rate <= 2 * found, f"rate_hz {rate:g}, but {found:.3g} Hz by the times", "the same"
-        )
+        what = f"rate_hz {rate:g}, but {found:.3g} Hz by the times"
+        require(found / 2 <= rate <= 2 * found, what, "the same")
         return f"{found:.3g} Hz"
 
     @check(OBSERVED, "a sample keeps its values", "a run processes samples in chunks")
@@ -236,9 +246,8 @@ class SourceTrial:
             require(source.length is None, found, "sha256 (hex) of all input of a recording")
             return "a live source"
         again = self.entry.open(self.settings, None).digest
-        require(
-            source.digest == again, f"digest {source.digest} and then {again}", "the same for the same input"
-        )
+        found = f"digest {source.digest} and then {again}"
+        require(source.digest == again, found, "the same for the same input")
         return ""
 
     @check(OBSERVED, "it can be read again", "a result could not be reproduced")
@@ -265,7 +274,7 @@ class _StoredSource(ClosedSource):
         return iter(self._samples)
 
 
-def require_shapes(found: Any, view_shape: tuple[int, ...], whiskers: int, what: str) -> None:
+def _require_shapes(found: Any, view_shape: tuple[int, ...], whiskers: int, what: str) -> None:
     """Raises `Violation` unless this is an observation of these shapes, with the dtypes of each field.
 
     Args:
@@ -289,7 +298,7 @@ def require_shapes(found: Any, view_shape: tuple[int, ...], whiskers: int, what:
         require(fits, f"{path} of {what} is {text}", f"NumPy {names[kind]} {shape}")
 
 
-def require_masked(found: Observation, what: str, signed: bool = False) -> None:
+def _require_masked(found: Observation, what: str, signed: bool = False) -> None:
     """Raises `Violation` if an observation has NaN or infinite values, or a view outside 0..1.
 
     Args:
@@ -303,10 +312,6 @@ def require_masked(found: Observation, what: str, signed: bool = False) -> None:
         require(low >= 0 and high <= 1, f"view of {what} has values {low:g} to {high:g}", "values in 0..1")
 
 
-ATTRIBUTES = ("name", "rate_hz", "view_shape", "whiskers", "length", "digest", "info")
-METHODS = ("__iter__", "__enter__", "__exit__")
-
-
 def check_source(
     name: str, assignments: Sequence[str] = (), touch: str | None = None, most: int = SAMPLES
 ) -> Iterator[Result]:
@@ -318,32 +323,154 @@ def check_source(
         most: samples to examine.
 
     Raises:
-        InputError: there is no such source or front end, its package is broken, the settings do not fit, or
-            the source refuses them, for example because a file is missing.
+        InputError: as `find_parts`, or the source refuses its settings, as a file that is missing.
     """
-    entry = SOURCES.get(name, "check source")
-    models: dict[str, Any] = {"settings": entry.config_class}
-    if touch is not None:
-        models["touch"] = TOUCH.get(touch, "--touch").config_class
-    settings = read_assignments(models, assignments)
+    parts = find_parts(
+        {"settings": (SOURCES, name, "check source"), "touch": (TOUCH, touch, "--touch")}, assignments
+    )
     frontend = None
     if touch is not None:
-        given = settings["touch"]
+        given = parts["touch"][1]
         plain = {} if given is None else json.loads(given.model_dump_json(exclude_unset=True))
         frontend = PluginConfig(plugin=touch, settings=plain)
-    trial = SourceTrial(entry, settings["settings"], frontend, most)
+    trial = SourceTrial(*parts["settings"], frontend, most)
     try:
         _ = trial.source
     except InputError:
         raise
     except Exception:  # reported by a check
         pass
-    return run_checks(CHECKS, trial)
+    return trial.run_checks()
 
 
 def _is_count(value: Any, least: int = 0) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= least
 
 
-CHECKS = checks_of(SourceTrial)
-"""All checks of a source."""
+class TouchTrial(Trial[TouchEntry]):
+    """A touch front end with settings: what its checks share, and the checks.
+
+    Args:
+        source: of its readings; None: a simulated session of the whisker head, whose readings are `Whisk`s.
+    """
+
+    def __init__(self, entry: TouchEntry, settings: Any, source: Source | None = None) -> None:
+        super().__init__(entry, settings)
+        self.source = source or HeadSimulation(SimulationConfig(), HeadConfig())
+
+    def build(self) -> ReadingProcessor:
+        """A new front end, as for a pass through the source."""
+        return self.entry.build(self.settings, self.source.info)
+
+    @cached_property
+    def first(self) -> ReadingProcessor:
+        return self.build()
+
+    @cached_property
+    def reading(self) -> Reading:
+        return Reading.of(self.source, READINGS)
+
+    @property
+    def readings(self) -> list[Any]:
+        """The readings of the first samples."""
+        return [sample.reading for sample in self.reading.samples]
+
+    @cached_property
+    def results(self) -> list[Observation | None]:
+        """What the first front end makes of each reading."""
+        return [self.first.observe(reading) for reading in self.readings]
+
+    def observations(self) -> list[tuple[str, Observation]]:
+        """The observations among the results, each with its name."""
+        return [(f"the observation of reading {k}", o) for k, o in enumerate(self.results) if o is not None]
+
+    @check(OPENED, "it builds for the source", "the backend is built from its attributes")
+    def builds(self) -> str:
+        front, source = self.first, self.source
+        missing = [name for name in ("view_shape", "whiskers", "observe") if not hasattr(front, name)]
+        found = f"{type(front).__name__} without {', '.join(missing)}"
+        require(not missing, found, "all of a ReadingProcessor")
+        shape, whiskers = front.view_shape, front.whiskers
+        counts = isinstance(shape, tuple) and len(shape) == 3
+        counts = counts and all(isinstance(n, int) and n > 0 for n in shape)
+        require(counts, f"view_shape {shape!r}", "a tuple of three sizes (R, C, K)")
+        found = f"{whiskers} whiskers for those of {source.name}"
+        require(whiskers == source.whiskers, found, f"{source.whiskers}, as the source says")
+        return f"view_shape {shape}, {whiskers} whiskers"
+
+    @check(READ, "observations have the declared shapes", "the kernel is compiled for them")
+    def views_have_shapes(self) -> str:
+        observations = self.observations()
+        found = f"None for all {len(self.results)} readings of {self.source.name}"
+        require(len(observations) > 0, found, "an observation for some of them")
+        for what, one in observations:
+            _require_shapes(one, self.first.view_shape, self.first.whiskers, what)
+        return f"{len(observations)} observations of {len(self.results)} readings of {self.source.name}"
+
+    @check(OBSERVED, "absent values are masked, not NaN", "one NaN spoils a step")
+    def masks_values(self) -> None:
+        for what, one in self.observations():
+            _require_masked(one, what)
+
+    @check(OBSERVED, "no motion is lost", "the pose is the sum of all motions")
+    def carries_motion(self) -> str:
+        if not all(hasattr(reading, "odometry") for reading in self.readings):
+            return "readings without odometry"
+        waiting: list[Any] = []
+        for k, (reading, result) in enumerate(zip(self.readings, self.results, strict=True)):
+            waiting.append(reading.odometry)
+            if result is None:
+                continue
+            if len(waiting) > 1:
+                together = np.zeros(3)  # m, m, rad, of successive motions
+                for motion in waiting:
+                    together = compose(together, np.array(motion[:3], float))
+                expected = np.append(together, sum(float(motion[3]) for motion in waiting))
+                found = np.array(result.odometry, float)
+                if not np.allclose(expected, found, rtol=0, atol=MOTION_TOLERANCE):
+                    what = f"odometry {found.tolist()} in the observation of reading {k} after None"
+                    raise Violation(what, f"{expected.tolist()}, with the motion of the readings before it")
+            waiting = []
+        return f"None for {sum(result is None for result in self.results)} readings"
+
+    @check(OBSERVED, "readings are not changed", "another pass would read other values")
+    def changes_no_reading(self) -> None:
+        _ = self.results
+        copies = [sample.reading for sample in self.reading.copies]
+        require_equal(copies, self.readings, "readings before and after they were observed")
+
+    @check(OBSERVED, "it is deterministic", "a result could not be reproduced")
+    def is_deterministic(self) -> None:
+        expected, front = self.results, self.build()
+        found = [front.observe(reading) for reading in self.readings]
+        require_equal(expected, found, "the results of two front ends with equal settings")
+
+    @check(OBSERVED, "it keeps nothing between passes", "each pass must give the same observations")
+    def separates_passes(self) -> None:
+        expected, first, second = self.results, self.build(), self.build()
+        require(first is not second, "one front end for two passes", "a new one for each pass from `build`")
+        found = []
+        for k, reading in enumerate(self.readings):
+            found.append(first.observe(reading))
+            second.observe(self.readings[k // 2])  # another pass, at another place
+        require_equal(expected, found, "the results of a pass alone and beside another one")
+
+
+def check_touch(name: str, assignments: Sequence[str] = (), source: str | None = None) -> Iterator[Result]:
+    """Checks the touch front end registered under a name.
+
+    Args:
+        assignments: of its settings, each `settings.key=value`; of those of the source `source.key=value`.
+        source: name of the registered source of its readings; None: `Whisk`s of the simulated head.
+
+    Raises:
+        InputError: as `find_parts`.
+    """
+    parts = find_parts(
+        {"settings": (TOUCH, name, "check touch"), "source": (SOURCES, source, "--source")}, assignments
+    )
+    readings = None
+    if source is not None:
+        entry, settings = parts["source"]
+        readings = entry.open(settings or NoSettings(), None)
+    return TouchTrial(*parts["settings"], readings).run_checks()

@@ -40,7 +40,7 @@ def cell_poses(shape: tuple[int, int, int], cell_size: float, cell: np.ndarray) 
     Raises:
         InputError: an index is no cell of the network.
     """
-    check_cells(shape, cell)
+    _check_cells(shape, cell)
     heading, y, x = np.unravel_index(np.asarray(cell, np.int64), shape)
     return packet_poses(shape, cell_size, np.stack([x, y, heading], axis=-1))
 
@@ -50,7 +50,7 @@ def packet_poses(shape: tuple[int, int, int], cell_size: float, packet: np.ndarr
     return np.asarray(packet, np.float64) * [cell_size, cell_size, 2 * np.pi / shape[0]]
 
 
-def check_cells(shape: tuple[int, int, int], cell: np.ndarray) -> None:
+def _check_cells(shape: tuple[int, int, int], cell: np.ndarray) -> None:
     """Checks the indices [C] of chosen cells.
 
     Raises:
@@ -125,7 +125,7 @@ def expected_spikes(recording: CellRecording, reference: float, peak_rate: float
     time, activity = np.asarray(recording.time, float), np.asarray(recording.activity, np.float64)
     if not (np.isfinite(reference) and reference > 0):
         raise InputError("reference", f"{reference}", "an activity above 0")
-    check_cells(recording.shape, recording.cell)
+    _check_cells(recording.shape, recording.cell)
     if len(time) < 2 or activity.shape != (len(time), len(recording.cell)):
         found = f"{len(time)} times and activity of shape {activity.shape}"
         expected = "[T] times and [T, C] activities of C cells, T at least 2"

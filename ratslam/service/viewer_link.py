@@ -49,7 +49,7 @@ class Viewer:
 
     def __init__(self, target: str, end: float = END, command: Sequence[str] | None = None) -> None:
         self.target, self.offered, self.dropped = target, 0, 0
-        self._end, self._warned = end, False
+        self._end = end
         # rerun logs broken connections at length; the process says it in one line.
         environment = os.environ | {"RUST_LOG": "off", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         self._process = subprocess.Popen(
@@ -160,9 +160,8 @@ def prepare_target(text: str) -> str:
             no viewer answers.
     """
     if find_spec("rerun") is None:
-        raise InputError(
-            "--rerun", "rerun is not installed", "the extra 'view'", "pip install 'ratslam[view]'"
-        )
+        cure = "pip install 'ratslam[view]'"
+        raise InputError("--rerun", "rerun is not installed", "the extra 'view'", cure)
     if text.endswith(".rrd"):
         require_new_file(Path(text))
         return os.path.abspath(text)

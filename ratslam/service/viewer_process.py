@@ -23,7 +23,8 @@ from tactile.whisker_geometry import Head
 
 APPLICATION = "ratslam"
 GREY, BLUE, GREEN, RED, ORANGE = (128, 128, 128), (60, 120, 216), (30, 160, 60), (200, 30, 30), (230, 140, 30)
-COLOUR_OF_VERDICT = {1: GREEN, 0: ORANGE, -1: RED}
+VERDICTS = {1: ("accepted", GREEN), 0: ("open", ORANGE), -1: ("removed", RED)}
+"""Name and colour of a verdict on a candidate, see `Map.judged_closures`."""
 STEP, TIME = "step", "session_time"
 """Timelines: number of the step, and s since the first one."""
 
@@ -62,7 +63,7 @@ class Drawing:
         self._whole = 0  # number of steps drawn when the whole path was
         self._place_step: dict[int, int] = {}
         self._links: set[tuple[int, int]] = set()
-        self._verdicts = VerdictLog()
+        self._verdicts: dict[tuple[int, int], int] = {}  # the last one on each candidate
 
     def begin(self, run: RunDescription) -> None:
         """Draws what does not change."""
@@ -89,8 +90,12 @@ class Drawing:
         if len(self._online.rows):
             self._draw_map(map)
 
-    def _log(self, name: str, *parts: Any, static: bool = False) -> None:
-        self._recording.log(name, *parts, static=static)
+    def _log(self, name: str, part: Any, static: bool = False) -> None:
+        self._recording.log(name, part, static=static)
+
+    def _log_lines(self, name: str, strips: list[Any], colour: tuple[int, int, int], width: float) -> None:
+        radius = self._rr.Radius.ui_points(width)
+        self._log(f"world/{name}", self._rr.LineStrips3D(strips, colors=[colour], radii=radius))
 
     def _draw_step(self, step: StepReport) -> None:
         self._start = step.time if self._start is None else self._start
@@ -137,47 +142,44 @@ class Drawing:
         if map.path is not None:
             self._path.replace(np.array(map.path))
             self._whole = len(self._online.rows)
-            self._draw_strip("odometry", self._odometry.rows, GREY)
-            self._draw_strip("online", self._online.rows, BLUE)
-            self._draw_strip("path", map.path, GREEN)
+            self._draw_path("odometry", self._odometry.rows, GREY)
+            self._draw_path("online", self._online.rows, BLUE)
+            self._draw_path("path", map.path, GREEN)
         recent = slice(max(0, self._whole - 1), None)
-        self._draw_strip("odometry/recent", self._odometry.rows[recent], GREY)
-        self._draw_strip("online/recent", self._online.rows[recent], BLUE)
-        self._draw_experiences()
+        self._draw_path("odometry/recent", self._odometry.rows[recent], GREY)
+        self._draw_path("online/recent", self._online.rows[recent], BLUE)
+        places = _on_floor(self._path.rows[list(self._place_step.values())])
+        if len(places):
+            radius = self._rr.Radius.ui_points(3.0)
+            self._log("world/experiences", self._rr.Points3D(places, colors=[BLUE], radii=radius))
+            known = [(a, b) for a, b in sorted(self._links) if a in self._place_step]
+            ends = np.array([[self._place_step[a], self._place_step[b]] for a, b in known], int)
+            self._draw_pairs("links", ends, GREY)
         self._draw_closures(map.closures)
         if map.grid is not None:
             self._draw_grid(map.grid)
 
-    def _draw_strip(self, name: str, poses: np.ndarray, colour: tuple[int, int, int]) -> None:
+    def _draw_path(self, name: str, poses: np.ndarray, colour: tuple[int, int, int]) -> None:
         if len(poses) > 1:
-            strip = self._rr.LineStrips3D(
-                [_on_floor(poses)], colors=[colour], radii=self._rr.Radius.ui_points(1.5)
-            )
-            self._log(f"world/{name}", strip)
+            self._log_lines(name, [_on_floor(poses)], colour, 1.5)
 
-    def _draw_experiences(self) -> None:
-        places = _on_floor(self._path.rows[list(self._place_step.values())])
-        if not len(places):
-            return
-        points = self._rr.Radius.ui_points
-        self._log("world/experiences", self._rr.Points3D(places, colors=[BLUE], radii=points(3.0)))
-        known = [(a, b) for a, b in sorted(self._links) if a in self._place_step]
-        ends = np.array([[self._place_step[a], self._place_step[b]] for a, b in known], int).reshape(-1, 2)
+    def _draw_pairs(self, name: str, ends: np.ndarray, colour: tuple[int, int, int]) -> None:
+        """Lines between pairs of steps [n, 2]."""
         strips = list(_on_floor(self._path.rows[ends.ravel()]).reshape(-1, 2, 3))
-        self._log("world/links", self._rr.LineStrips3D(strips, colors=[GREY], radii=points(1.0)))
+        self._log_lines(name, strips, colour, 1.0)
 
     def _draw_closures(self, closures: np.ndarray) -> None:
-        for earlier, later, verdict in self._verdicts.changes(closures):
-            text = f"step {later} with step {earlier}: {verdict}"
-            self._log("judgements", self._rr.TextLog(text))
+        """Candidates by their verdict, and as text each change of one: `dropped` was accepted before."""
+        for earlier, later, sign in closures.tolist():
+            before = self._verdicts.get((earlier, later))
+            if before != sign:
+                self._verdicts[earlier, later] = sign
+                verdict = "dropped" if before == 1 else VERDICTS[sign][0]
+                text = f"step {later} with step {earlier}: {verdict}"
+                self._log("judgements", self._rr.TextLog(text))
         known = closures[(closures[:, :2] < len(self._path.rows)).all(axis=1)]
-        for sign, name in VERDICTS.items():
-            ends = known[known[:, 2] == sign, :2]
-            strips = list(_on_floor(self._path.rows[ends.ravel()]).reshape(-1, 2, 3))
-            lines = self._rr.LineStrips3D(
-                strips, colors=[COLOUR_OF_VERDICT[sign]], radii=self._rr.Radius.ui_points(1.0)
-            )
-            self._log(f"world/closures/{name}", lines)
+        for sign, (name, colour) in VERDICTS.items():
+            self._draw_pairs(f"closures/{name}", known[known[:, 2] == sign, :2], colour)
 
     def _draw_activity(self, activity: PoseCellActivity) -> None:
         # Rows of an image count downwards, y upwards.
@@ -218,34 +220,6 @@ class Drawing:
 def _on_floor(poses: np.ndarray) -> np.ndarray:
     """Points [n, 3] of poses [n, 3] at height 0."""
     return np.column_stack([poses[:, :2], np.zeros(len(poses))]) if len(poses) else np.zeros((0, 3))
-
-
-VERDICTS = {1: "accepted", 0: "open", -1: "removed"}
-
-
-class VerdictLog:
-    """The last verdict on each candidate."""
-
-    def __init__(self) -> None:
-        self._verdict: dict[tuple[int, int], int] = {}
-
-    def changes(self, closures: np.ndarray) -> list[tuple[int, int, str]]:
-        """The new verdicts since the last call: earlier and later step of the candidate, verdict by name.
-
-        `dropped` is the verdict on one that was accepted before.
-
-        Args:
-            closures: [n, 3], see `Map.judged_closures`.
-        """
-        found = []
-        for earlier, later, sign in closures.tolist():
-            before = self._verdict.get((earlier, later))
-            if before == sign:
-                continue
-            self._verdict[earlier, later] = sign
-            name = "dropped" if before == 1 else VERDICTS[sign]
-            found.append((earlier, later, name))
-        return found
 
 
 def _blueprint(run: RunDescription) -> Any:

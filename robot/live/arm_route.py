@@ -49,26 +49,18 @@ class _Route:
         self.targets, self.speed = targets, speed
         self.sent = 0
 
-    @property
-    def length(self) -> int:
-        return len(self.targets)
-
     def advance(self, arm: MovableArm) -> bool:
-        """Sends the next target if the arm has arrived; returns whether it is at the last one.
-
-        Raises:
-            robot.drivers.ur10.safety.TargetRefused: the target is rejected.
-        """
+        """See `ArmRoute`; a target is sent when the arm has arrived at the one before."""
         if self.sent and not arm.arrived():
             return False
-        if self.sent == self.length:
+        if self.sent == len(self.targets):
             return True
         arm.move(self.targets[self.sent], self.speed)
         self.sent += 1
         return False
 
     def resend_last(self) -> None:
-        """Sends the last target again with the next `advance`, after a stop on the way to it."""
+        """See `ArmRoute`."""
         self.sent = max(self.sent - 1, 0)
 
 
@@ -112,19 +104,12 @@ def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
     return make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
 
 
-def main_route(config: LiveConfig, path: HeadPath) -> _Route:
-    """The route along a path, without its first pose, where the arm starts."""
-    return _Route(config.arm.placing.tcp_from_pose(path.pose[1:]), config.route_speed)
-
-
-def approach_route(config: LiveConfig, path: HeadPath) -> _Route:
-    """The route from the present pose of the arm to above the first pose."""
-    return _Route(config.arm.placing.tcp_from_pose(path.pose[:1], config.lift), config.route_speed)
-
-
-def descent_route(config: LiveConfig, path: HeadPath) -> _Route:
-    """The route from above the first pose down to it."""
-    return _Route(config.arm.placing.tcp_from_pose(path.pose[:1]), config.route_speed)
+def arm_routes(config: LiveConfig, path: HeadPath) -> tuple[_Route, _Route, _Route]:
+    """From the present pose of the arm to above the first pose of a path; down to it; along the path, without
+    its first pose, where the arm starts."""
+    place, speed = config.arm.placing.tcp_from_pose, config.route_speed
+    above, first, rest = place(path.pose[:1], config.lift), place(path.pose[:1]), place(path.pose[1:])
+    return _Route(above, speed), _Route(first, speed), _Route(rest, speed)
 
 
 def check_targets(config: LiveConfig, path: HeadPath) -> None:
@@ -133,8 +118,7 @@ def check_targets(config: LiveConfig, path: HeadPath) -> None:
     Raises:
         InputError: a target is rejected; the error gives its number and the reason.
     """
-    routes = approach_route(config, path), descent_route(config, path), main_route(config, path)
-    targets = np.concatenate([route.targets for route in routes])
+    targets = np.concatenate([route.targets for route in arm_routes(config, path)])
     before = targets[0]
     for target in targets:
         try:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Self
 
 import numpy as np
 
@@ -20,14 +19,7 @@ from robot.drivers.head.reader import HeadReader
 from robot.drivers.head.usb_protocol import to_radians
 from robot.drivers.outcome import SessionOutcome
 from robot.live.live_config import LiveConfig
-from robot.live.polling import (
-    AsyncMapper,
-    OperatorStop,
-    PolledRig,
-    SessionFault,
-    check_mapper,
-    session_fault,
-)
+from robot.live.polling import AsyncMapper, OperatorStop, PolledRig, SessionFault, check_mapper, session_fault
 from robot.simulation.create.state_machine import (
     CreateState,
     MachineState,
@@ -61,9 +53,6 @@ MAX_READ_TIME = 1.0
 class CreateRig(PolledRig):
     """The robot and the whiskers of a session; a context manager that leaves the robot at rest.
 
-    Args:
-        config: with a part `create`. stopped: whether the operator has requested the end.
-
     Attributes:
         create: settings of the robot. robot, head: the devices. monitor: strain of the whiskers. alive: [W]
             bool, whiskers with a signal.
@@ -85,11 +74,7 @@ class CreateRig(PolledRig):
         self._free = self.epoch  # newest time at which the bumper was not pressed
 
     def poll(self) -> None:
-        """Reads the samples of the whiskers and the state of the robot.
-
-        Raises:
-            SessionFault, OperatorStop: the session must end.
-        """
+        """Reads the samples of the whiskers and the state of the robot; see `PolledRig`."""
         for frames, arrival in self.stream.take():
             if self.stream.restarts != self._connections:
                 self._connections = self.stream.restarts
@@ -102,9 +87,8 @@ class CreateRig(PolledRig):
         if stop is not None and stop.reason in OUTCOMES:
             detail = stop.detail
             if stop.reason is StopReason.UNPLUGGED:
-                detail += (
-                    f"; a watchdog process waits {self.create.replug:g} s for {self.create.port} to return"
-                )
+                wait, port = self.create.replug, self.create.port
+                detail += f"; a watchdog process waits {wait:g} s for {port} to return"
             raise session_fault(OUTCOMES[stop.reason], detail)
         if fault:
             raise SessionFault(fault)
@@ -159,9 +143,6 @@ class CreateRig(PolledRig):
         self.robot.refresh()
         motion = self.robot.odometry()
         return self.robot.counts.good > good and not any(motion[:3])
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.robot.close()

@@ -57,10 +57,6 @@ class GoalConfig(Settings):
     replans: NonNegativeInt = 5
     """Number of new ways for a goal, after which it counts as blocked."""
 
-    def resolved(self, folder: Path) -> GoalConfig:
-        """A copy with a relative path of the map taken from the folder."""
-        return self.model_copy(update={"map": folder / self.map})
-
 
 ARM_ONLY = ("arm", "plan", "waypoints", "whisks", "odometry", "noise", "lift", "budget", "grace")
 """Settings without a meaning for a Create."""
@@ -79,21 +75,12 @@ class CreateLiveConfig(CreateConfig):
     budget: PositiveFloat = 2.0
     """Lag of the mapper above which the robot waits for it, s."""
 
-    def resolved(self, folder: Path) -> CreateLiveConfig:
-        """A copy with relative paths taken from the folder; the port's name stays as it is."""
-        return self.model_copy(update={"plan": self.plan.resolved(folder)})
-
 
 class LivePlanConfig(SimulationConfig):
     """Plan of a session on the arm: as of a simulated session, or goals on a saved map."""
 
     goal: GoalConfig | None = None
     """Goals to drive to on a saved map, instead of the path."""
-
-    def resolved(self, folder: Path) -> LivePlanConfig:
-        plan = super().resolved(folder)
-        assert isinstance(plan, LivePlanConfig)
-        return plan if plan.goal is None else plan.model_copy(update={"goal": plan.goal.resolved(folder)})
 
 
 class LiveConfig(Settings):
@@ -145,9 +132,3 @@ class LiveConfig(Settings):
         if self.create is not None and given:
             raise ValueError(f"create and {', '.join(given)}: a session has one robot, a Create or an arm")
         return self
-
-    def resolved(self, folder: Path) -> LiveConfig:
-        """A copy with relative paths taken from the folder (of the configuration file)."""
-        if self.create is not None:
-            return self.model_copy(update={"create": self.create.resolved(folder)})
-        return self.model_copy(update={"plan": self.plan.resolved(folder)})

@@ -21,11 +21,9 @@ from tactile.whisker_geometry import HeadConfig, ur10_head
 def arm_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> UrEmulatorConfig:
     """A controller at the session's address, or another one; the arm starts above the first pose of the
     route."""
-    start = plan_path(config, ur10_head(head)).pose[0]
-    start = config.arm.placing.tcp_from_pose(start, config.lift / 2)
-    return UrEmulatorConfig(
-        host=host or config.arm.host, hz=config.arm.hz, start=tuple(np.asarray(start).tolist())
-    )
+    arm, first = config.arm, plan_path(config, ur10_head(head)).pose[0]
+    start = np.asarray(arm.placing.tcp_from_pose(first, config.lift / 2))
+    return UrEmulatorConfig(host=host or arm.host, hz=arm.hz, start=tuple(start.tolist()))
 
 
 def head_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> HeadEmulatorConfig:

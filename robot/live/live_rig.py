@@ -10,7 +10,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable
 from itertools import islice
-from typing import Self
+from operator import itemgetter
 
 import numpy as np
 
@@ -53,16 +53,11 @@ class ArmOdometry:
         while self._states and self._states[0][0] < self._states[-1][0] - HISTORY:
             self._states.popleft()
 
-    @property
-    def span(self) -> float:
-        """Time span of the stored states, s."""
-        return self._states[-1][0] - self._states[0][0] if self._states else 0.0
-
     def pose(self, time: float) -> np.ndarray:
         """Pose of the head in the map [3] at a time, interpolated between two states; outside
         their span, the nearest pose."""
         last = len(self._states) - 1
-        k = min(max(bisect_left(self._states, time, key=_time_of), 1), last)
+        k = min(max(bisect_left(self._states, time, key=itemgetter(0)), 1), last)
         pair = [self._states[max(k - 1, 0)], self._states[k]]
         poses, _ = self._config.arm.placing.pose_from_tcp(np.stack([state[1] for state in pair]))
         span = pair[1][0] - pair[0][0]
@@ -96,7 +91,7 @@ class ArmOdometry:
 
     def _integrate_velocity(self, start: np.ndarray, took: float, time: float) -> np.ndarray:
         """Pose reached from the last one at the mean velocity since then."""
-        since, until = (bisect_right(self._states, end, key=_time_of) for end in (time - took, time))
+        since, until = (bisect_right(self._states, end, key=itemgetter(0)) for end in (time - took, time))
         states = list(islice(self._states, since, until))
         if not states:
             return start
@@ -110,19 +105,12 @@ class ArmOdometry:
         return compose(start, motion)
 
 
-def _time_of(state: tuple[float, np.ndarray, np.ndarray]) -> float:
-    return state[0]
-
-
 MAX_REST_TIME, REST_TIME = 2.0, 0.3
 """Longest wait for a stopped arm, and required time at rest, s: after a contact it stops, then backs off."""
 
 
 class Rig(PolledRig):
     """The two devices of a session; a context manager that leaves both at rest.
-
-    Args:
-        stopped: whether the operator has requested the end.
 
     Attributes:
         arm, head, driver: the devices. odometer: of the arm. state_ages: age of the newest state at each
@@ -149,11 +137,7 @@ class Rig(PolledRig):
         self._seen = 0
 
     def poll(self) -> None:
-        """Reads the data of both devices.
-
-        Raises:
-            SessionFault, OperatorStop: the session must end.
-        """
+        """Reads the data of both devices; see `PolledRig`."""
         for frames, arrival in self.stream.take():
             if self.recorder is not None:
                 self.recorder.add_frames(frames, arrival - self.epoch)
@@ -198,9 +182,6 @@ class Rig(PolledRig):
         if self.recorder is not None:
             states["host"] -= self.epoch
             self.recorder.add_states(states)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is KeyboardInterrupt:  # second interrupt: stop by the dashboard server at once

@@ -9,7 +9,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable, Iterator
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -150,6 +150,9 @@ class PolledRig:
             self.poll()
             time.sleep(TICK)
 
+    def __enter__(self) -> Self:
+        return self
+
     def record_event(self, name: str, text: str) -> None:
         """Records an event."""
         if self.recorder is not None:
@@ -157,25 +160,14 @@ class PolledRig:
 
 
 class AsyncMapper(Protocol):
-    """Asynchronous mapper interface."""
+    """The methods of `ratslam.live.mapper_process.Mapper` that a loop calls."""
 
     @property
-    def alive(self) -> bool:
-        """Whether the mapper runs."""
-        ...
-
+    def alive(self) -> bool: ...
     @property
-    def failure(self) -> str:
-        """Reason for the end of the mapper."""
-        ...
-
-    def behind(self) -> float:
-        """Waiting time of the oldest unmapped sample, s."""
-        ...
-
-    def offer(self, sample: Sample) -> None:
-        """Passes the next sample; returns at once."""
-        ...
+    def failure(self) -> str: ...
+    def behind(self) -> float: ...
+    def offer(self, sample: Sample) -> None: ...
 
 
 def check_mapper(mapper: AsyncMapper) -> None:

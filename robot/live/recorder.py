@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from threading import Lock
 from typing import Self
 
@@ -18,7 +17,7 @@ from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.recordings.cdr import Event
 from robot.recordings.mcap_writer import Recorder, RecordingWriteError
-from robot.sources.source import Sample, SourceDescription, SourceInfo
+from robot.sources.source import Sample
 
 BLOCK_TIME = 0.15
 """Time for which frames and states are collected into a block, s."""
@@ -31,36 +30,20 @@ class LiveRecorder:
     ignored, and the recording stays readable up to that point.
 
     Args:
-        path: must not exist yet. view_shape, whiskers, rate_hz, info: see `Recorder`.
+        tape: the new file.
 
     Attributes:
         fault: the error that ended writing, or None.
-
-    Raises:
-        InputError: the file exists or cannot be created.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        view_shape: tuple[int, int, int],
-        whiskers: int,
-        rate_hz: float = 0.0,
-        info: SourceInfo,
-    ) -> None:
+    def __init__(self, tape: Recorder) -> None:
         self.fault: Fault | None = None
-        self._tape = Recorder(path, SourceDescription(view_shape, whiskers, rate_hz, info))
+        self._tape = tape
         self._lock = Lock()
         self._frames: list[Frames] = []
         self._states: list[np.ndarray] = []
         self._arrival = self._since = -np.inf  # times of the newest frames and of the oldest pending data
         self._known = np.full(MAX_FRAMES, -1, np.int64)  # sequence numbers of added frames
-
-    @property
-    def count(self) -> int:
-        """Number of readings so far."""
-        return self._tape.count
 
     def add_frames(self, frames: Frames, arrival: float) -> None:
         """Adds frames that arrived at a time, s; frames added before are ignored."""

@@ -30,22 +30,25 @@ LISTEN_TIME = 1.5
 """Time for which the streams are observed, s."""
 MIN_RATE_SHARE = 0.9
 """Required share of a stream's nominal rate."""
-FEWEST_ALIVE = 1
-"""Least number of whiskers of a Create with a signal."""
 
 
-def check_arm_session(config: LiveConfig, head: HeadConfig, directory: Path) -> Iterator[str]:
-    """Checks what a session needs without starting a program on the arm, which then cannot move; yields
-    a line of text for each passed check.
+def check_session(config: LiveConfig, head: HeadConfig, directory: Path) -> Iterator[str]:
+    """Checks what a session needs, without a motion; yields a line of text for each passed check. No program
+    is started on an arm, which then cannot move.
 
     Args:
-        head: geometry of the whisker head. directory: in which the session would make its run directory.
+        head: geometry of an arm's whisker head. directory: in which the session would make its run directory.
 
     Raises:
         InputError: a check failed; the error gives its cure.
-        robot.live.polling.SessionFault: the head failed meanwhile.
+        robot.live.polling.SessionFault: a device failed meanwhile.
     """
     yield check_disk(config, directory)
+    if config.create is not None:
+        with CreateRig(config, lambda: False) as robot:
+            yield from find_devices(robot)
+            yield from start_and_check(robot)
+        return
     path = plan_path(config, ur10_head(head))
     check_targets(config, path)
     yield f"route: {path.duration:.0f} s, every target is within the arm's limits"
@@ -53,22 +56,6 @@ def check_arm_session(config: LiveConfig, head: HeadConfig, directory: Path) -> 
         yield from find_devices(rig)
         _check_stream(rig)
         yield f"clocks: head {rig.stream.clock.residual * 1e3:.1f} ms"
-
-
-def check_create(config: LiveConfig, directory: Path) -> Iterator[str]:
-    """Checks everything that a session needs, without a motion; yields a line for each passed check.
-
-    Args:
-        config: with a part `create`. directory: in which the session would make its run directory.
-
-    Raises:
-        InputError: a check failed; the error gives its cure.
-        robot.live.polling.SessionFault: a device failed meanwhile.
-    """
-    yield check_disk(config, directory)
-    with CreateRig(config, lambda: False) as rig:
-        yield from find_devices(rig)
-        yield from start_and_check(rig)
 
 
 def check_disk(config: LiveConfig, directory: Path) -> str:
@@ -136,9 +123,8 @@ def start_and_check(rig: Rig | CreateRig) -> Iterator[str]:
         reply = rig.robot.last_reply
         if reply is not None and reply.bumps & Bumps.BUMPED:
             found = f"{reply.bumps.describe()} pressed"
-            raise InputError(
-                "live.create", found, "a free bumper", "move the robot away from what it touches"
-            )
+            cure = "move the robot away from what it touches"
+            raise InputError("live.create", found, "a free bumper", cure)
         yield f"Create: {rig.create.port}, safe mode, at rest, guarded by a watchdog process"
         rig.monitor.begin()
     else:
@@ -155,11 +141,7 @@ def start_and_check(rig: Rig | CreateRig) -> Iterator[str]:
 
 
 def _check_stream(rig: PolledRig) -> None:
-    """Listens to the head for a while and checks rate, damage and clock of its samples.
-
-    Raises:
-        InputError: a check failed; the error gives its cure.
-    """
+    """Listens to the head for a while and checks rate, damage and clock of its samples."""
     head, residual = rig.head, rig.config.residual
     identity = head.identity
     assert identity is not None
@@ -169,9 +151,8 @@ def _check_stream(rig: PolledRig) -> None:
     after = head.decoder.counts
     rate = (after.good - before.good) / LISTEN_TIME
     if rate < MIN_RATE_SHARE * identity.rate:
-        raise InputError(
-            "head", f"{rate:.0f} of {identity.rate:g} samples per second", "", "check the USB hub and cable"
-        )
+        found = f"{rate:.0f} of {identity.rate:g} samples per second"
+        raise InputError("head", found, "", "check the USB hub and cable")
     if after.bad > before.bad:
         found = f"{after.bad - before.bad} damaged samples in {LISTEN_TIME:g} s"
         raise InputError("head", found, "none", "change the cable")
@@ -187,7 +168,7 @@ def _check_whiskers(rig: CreateRig) -> str:
     assert newest is not None
     values = rig.head.ring.between(newest[0] - round(rig.monitor.rate), newest[0]).values
     rig.alive &= (values[..., 1:] != values[:1, :, 1:]).any(axis=(0, 2))
-    if rig.alive.sum() < FEWEST_ALIVE:
+    if not rig.alive.any():
         raise InputError("head", "no whisker has a signal", "", "check the cables of the whiskers")
     rows = rig.monitor.rows(len(values))
     # A whisker that shakes at rest by half the strain of a contact would report contacts.
@@ -201,6 +182,5 @@ def _check_whiskers(rig: CreateRig) -> str:
     level = 1e6 * float(np.abs(rows - rows.mean(axis=0)).std())
     dead = [str(k) for k in np.flatnonzero(~rig.alive)]
     without = f", without a signal: {', '.join(dead)}" if dead else ""
-    return (
-        f"whiskers: {int(rig.alive.sum())} of {len(rig.alive)} alive, noise {level:.1f} microstrain{without}"
-    )
+    alive = f"{int(rig.alive.sum())} of {len(rig.alive)} alive"
+    return f"whiskers: {alive}, noise {level:.1f} microstrain{without}"

@@ -25,12 +25,10 @@ class WhiskReport(NamedTuple):
     """Report on a passed-on whisk.
 
     Attributes:
-        number: of the whisk. lateness: time from its end to passing on, s. seen: whether its image was
-            included. missing: number of frames that had not arrived. pose: [3] by the arm, at
-            mid-protraction.
+        lateness: time from its end to passing on, s. seen: whether its image was included. missing: number of
+            frames that had not arrived. pose: [3] by the arm, at mid-protraction.
     """
 
-    number: int
     lateness: float
     seen: bool
     missing: int
@@ -167,14 +165,13 @@ def _hand_on(rig: Rig, sequence: _WhiskSequence, number: int, mapper: AsyncMappe
     whole, slow = bool(np.diff(numbers).max() <= gap and even), mapper.behind() > rig.config.budget
     cut = Cut.of(number, stamp, start, frames, odometry, seen=whole and not slow)
     if not cut.seen:
-        rig.record_event(
-            "dropped", f"whisk {number}: " + ("the mapper is behind" if whole else "samples are missing")
-        )
+        reason = "the mapper is behind" if whole else "samples are missing"
+        rig.record_event("dropped", f"whisk {number}: {reason}")
     if rig.recorder is not None:
         rig.recorder.add_whisk(cut, frames, truth)
     mapper.offer(Sample(stamp, assemble_cycle(frames, cut), truth))
     missing = sequence.samples - len(frames.sequence)
-    return WhiskReport(number, time.monotonic() - due, cut.seen, missing, truth)
+    return WhiskReport(time.monotonic() - due, cut.seen, missing, truth)
 
 
 def _advance(rig: Rig, route: ArmRoute) -> bool:

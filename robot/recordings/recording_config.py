@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Self
 
 from robot.recordings.bags.topics_config import TopicsConfig
 from robot.recordings.csv_config import CsvConfig
@@ -33,7 +34,7 @@ class RecordingConfig(StretchConfig):
     limits: UnitLimits = DEFAULT_LIMITS
     """Limits of the unit check, beyond which a recording is refused."""
 
-    def resolved(self, folder: Path) -> RecordingConfig:
+    def resolved(self, folder: Path) -> Self:
         """A copy with absolute paths; relative ones start at `folder`.
 
         One `*` in the file name of a part of the table or of the video stands for the beginning of the

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -14,3 +15,14 @@ class Settings(BaseModel):
     """Base class of configuration sections: immutable, rejects unknown keys and non-finite numbers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+    def resolved(self, folder: Path) -> Self:
+        """A copy with relative paths, also those of its sections, taken from a folder, such as that of the
+        configuration file."""
+        found: dict[str, Any] = {}
+        for name, value in self:
+            if isinstance(value, Path):
+                found[name] = folder / value
+            elif isinstance(value, Settings) and (section := value.resolved(folder)) is not value:
+                found[name] = section
+        return self.model_copy(update=found) if found else self

@@ -74,12 +74,6 @@ class ReportFrontendConfig(Settings):
             raise ValueError(f"{found} exceeds the whisker length of {self.length:g} m")
         return self
 
-    def resolved(self, folder: Path) -> ReportFrontendConfig:
-        """A copy with relative paths resolved against a folder."""
-        if self.templates is None:
-            return self
-        return self.model_copy(update={"templates": folder / self.templates})
-
     @property
     def feelers(self) -> PlanarWhiskers:
         """The whiskers in the plane."""

@@ -22,6 +22,7 @@ from evaluation.papers.maps.operations import MapTask, Measured
 from evaluation.papers.maps.pictures import PathPanel, count, draw_panels, median, spread, table
 from evaluation.papers.maps.scenarios import Recipe, ten_circuits
 from evaluation.papers.maps.stored_maps import StoredMap
+from ratslam.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from ratslam.live.goal_planner import GoalPlanner, contact_map, felt_points
 from ratslam.places.localiser import Localiser
 from ratslam.runs.localise import localising
@@ -31,7 +32,6 @@ from robot.drivers.outcome import Fault
 from robot.drivers.ur10.safety import plan_move
 from robot.emulators.ur10.emulated_arm import EmulatedArm, MoveL
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
-from robot.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from robot.live.live_config import GoalConfig, LiveConfig
 from robot.live.live_rig import ArmOdometry
 from robot.simulation.head.kinematic import HeadSetup, simulate_kinematic
@@ -255,9 +255,9 @@ class ClosedLoop:
         """Drives to an experience."""
         goal = GoalConfig(map=self._stored.path, to=(experience,))
         planner = GoalPlanner(self.experiences, goal, self._live.plan.motion)
-        drive, first, whisks = GoalDrive(goal, planner, self._cell, 1), len(self._arm.poses) - 1, 0
+        drive, first, whisks = GoalDrive(goal, planner, self._cell), len(self._arm.poses) - 1, 0
         if self._route is None:
-            self._route = GoalRoute(drive, self._live, drive.off_way, goal.coast, self._contacts)
+            self._route = GoalRoute(drive, self._live, self._contacts)
         self._route.drive = drive
         while whisks < LONGEST and not self._route.advance(self._arm):
             self._route.see(*self._sight())

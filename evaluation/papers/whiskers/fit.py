@@ -13,8 +13,8 @@ from evaluation.papers.tables.recordings import REACH, require_recordings
 from evaluation.plots import style
 from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
-from ratslam.service.record_fit import RevisitFit, fit_revisits, read_signals_of_reach
-from ratslam.service.rig_fit import WheelFit, fit_wheels
+from ratslam.service.record_fit import fit_revisits, read_signals_of_reach
+from ratslam.service.rig_fit import Rig, WheelFit, fit_wheels
 from robot.sources.in_memory import load_into_memory, select_rows
 from robot.sources.odometry import UNCORRECTED, correct_motions
 from tactile.base.plugins import PluginConfig
@@ -37,7 +37,7 @@ VALUES = {"length_scale": 1.0, "turn_scale": 1.0, "heading_bias": 0.0}
 """The quantities of the table, and what is assumed."""
 
 
-_Record = tuple[list[WheelFit], list[tuple[np.ndarray, ...]], RevisitFit | None]
+_Record = tuple[list[WheelFit], list[tuple[np.ndarray, ...]], Rig | None]
 """The wheels of a record: fitted on all of it and on each half; of each half, its true path and the paths by
 odometry, as recorded and corrected by the fit of the other, [N, 3]; from revisits, where it was mapped."""
 _Rigs = tuple[dict[str, _Record], SignalRecord, SignalFit]
@@ -108,7 +108,8 @@ def _table(result: _Rigs) -> list[str]:
         cells = ["; ".join(_pair(getattr(fit, key)) for fit in fits) for key in VALUES]
         lines.append(f"| {name} | {' | '.join(cells)} |")
         if revisits is not None:
-            turn, bias = _pair(revisits.turn_scale), _pair(revisits.heading_bias)
+            known = {one.name: (one.value, one.sd or 0.0) for one in revisits.quantities}
+            turn, bias = _pair(known.get("turn scale")), _pair(known["heading bias"])
             lines.append(f"| {name}, from revisits alone | not told by revisits | {turn} | {bias} |")
     lines += [
         "",

@@ -7,7 +7,6 @@ behaviour, wheels, strain), so that changing one part leaves the others unchange
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path as File
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -67,13 +66,6 @@ class CreateSimulationConfig(Settings):
     """Number of steps, instead of a duration."""
     seed: NonNegativeInt = 0
     """Seed of all random streams."""
-
-    def resolved(self, folder: File) -> CreateSimulationConfig:
-        """A copy with relative paths taken from the folder, such as that of the configuration file."""
-        if self.arena.file is None:
-            return self
-        arena = self.arena.model_copy(update={"file": folder / self.arena.file})
-        return self.model_copy(update={"arena": arena})
 
 
 class CreateSimulation(SimulatedSource):

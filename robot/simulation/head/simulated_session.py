@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import deepcopy
-from pathlib import Path as File
 from typing import Annotated, Literal
 
 import numpy as np
@@ -184,13 +183,6 @@ class SimulationConfig(Settings):
     """Model of the mechanics; `auto`: the cheapest one that gives the requested data."""
     raw: bool = False
     """Whether to give raw whisker samples, 2000 per second."""
-
-    def resolved(self, folder: File) -> SimulationConfig:
-        """A copy with relative paths taken from the folder, such as that of the configuration file."""
-        if self.maze.file is None:
-            return self
-        maze = self.maze.model_copy(update={"file": folder / self.maze.file})
-        return self.model_copy(update={"maze": maze})
 
 
 Tier = Literal["kinematic", "quasistatic", "dynamic"]

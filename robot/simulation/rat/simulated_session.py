@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from functools import partial
 from math import atan2, cos, exp, pi, sin
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
@@ -73,7 +73,7 @@ class PathFileConfig(MotionConfig):
     skip: NonNegativeFloat = 0.0
     """Time to leave out at the beginning, s."""
 
-    def resolved(self, folder: Path) -> PathFileConfig:
+    def resolved(self, folder: Path) -> Self:
         """A copy whose file, unless packaged, is taken from the folder."""
         if str(self.file) in PACKAGED:
             return self
@@ -232,10 +232,6 @@ class RatSimulationConfig(Settings):
     """Changes during the session, such as darkness."""
     seed: NonNegativeInt = 0
     """Seed of all random streams."""
-
-    def resolved(self, folder: Path) -> RatSimulationConfig:
-        """A copy with relative paths taken from the folder, such as that of the configuration file."""
-        return self.model_copy(update={"path": self.path.resolved(folder)})
 
 
 class RatSimulation(SimulatedSource):

@@ -10,11 +10,12 @@ import pytest
 from ratslam.cli import main
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import dump_data
-from ratslam.service.record_fit import walls_of
 from ratslam.service.rig_fit import Quantity, Rig
 from robot.recordings.mcap_writer import record_source
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.odometry import from_motions
+from robot.world.maze import parse_maze, wall_boxes
+from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
 from tactile.whisker_geometry import HeadConfig
 
@@ -132,6 +133,8 @@ def test_settings_are_those_that_differ() -> None:
 def test_the_walls_are_those_of_the_simulation() -> None:
     settings = {"path": {"explore": 5}, "maze": {"heights": [0.03, 0.05]}}
     source = HeadSimulation(SimulationConfig.model_validate(settings))
-    again, walls = walls_of(source.info), source.scene.surroundings.walls
+    maze, walls = source.info.maze, source.scene.surroundings.walls
+    heights = stream(maze.seed, "maze.heights")
+    again = wall_boxes(parse_maze(maze.text, Path("maze of the recording")), heights, maze.heights)
     np.testing.assert_array_equal(again.box, walls.box)
     np.testing.assert_array_equal(again.height, walls.height)

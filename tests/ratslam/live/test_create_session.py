@@ -14,10 +14,11 @@ import pytest
 from ratslam.runs.run import run
 from ratslam.runs.settings.run_config import load_config
 from robot.live.live_config import LiveConfig
-from robot.live.selftest import check_create
+from robot.live.selftest import check_session
 from robot.recordings.mcap_reader import Recording
 from tactile.base.errors import InputError
 from tactile.base.types import MotionKind, StepEnd
+from tactile.whisker_geometry import HeadConfig
 from tests.helpers.live import PATIENCE, until
 from tests.ratslam.live.create_bench import CreateBench, child_of, create_bench, kill
 from tests.ratslam.live.live_session import Session
@@ -133,7 +134,9 @@ def test_the_self_test_moves_nothing(robot: CreateBench, tmp_path: Path, monkeyp
     monkeypatch.setattr("robot.live.selftest.LISTEN_TIME", 0.3)
     monkeypatch.setattr("robot.live.selftest.MIN_RATE_SHARE", 0.0)
     before = robot.state()
-    lines = list(check_create(LiveConfig.model_validate(robot.live(**SLACK)), tmp_path / "run"))
+    lines = list(
+        check_session(LiveConfig.model_validate(robot.live(**SLACK)), HeadConfig(), tmp_path / "run")
+    )
     until(lambda: robot.state()["mode"] == "PASSIVE", "the robot is passive again")
     after = robot.state()
     assert (before["x"], before["y"], before["speeds"]) == (after["x"], after["y"], after["speeds"])
@@ -142,7 +145,7 @@ def test_the_self_test_moves_nothing(robot: CreateBench, tmp_path: Path, monkeyp
         assert part in text
     robot.robot("bump")
     with pytest.raises(InputError, match="left pressed"):
-        list(check_create(LiveConfig.model_validate(robot.live(**SLACK)), tmp_path / "run"))
+        list(check_session(LiveConfig.model_validate(robot.live(**SLACK)), HeadConfig(), tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 

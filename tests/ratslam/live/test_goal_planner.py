@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from evaluation.papers.maps.goals import VirtualArm
-from ratslam.live.goal_planner import GoalPlanner, felt_points
-from robot.live.goal_drive import DriveState, GoalDrive, GoalRoute
+from ratslam.live.goal_drive import DriveState, GoalDrive, GoalRoute
+from ratslam.live.goal_planner import RECENT, GoalPlanner, felt_points
+from ratslam.places.contact_alignment import RememberedContacts
 from robot.live.live_config import GoalConfig, LiveConfig
 from robot.world.maze import Maze, cell_centre, random_maze, wall_boxes
 from robot.world.scene import MotionConfig
@@ -67,8 +68,8 @@ def drive(graph: networkx.DiGraph, made: Maze, goal: int, most: int = 150) -> tu
     """Drives from the first cell; the estimate is the truth with an error."""
     config = GoalConfig(map=Path("map.npz"), to=(goal,))
     live = LiveConfig.model_validate({"plan": {"motion": {"speed": 0.045}}})
-    steered = GoalDrive(config, GoalPlanner(graph, config, live.plan.motion), 0.05, 1)
-    route = GoalRoute(steered, live, steered.off_way, config.coast)
+    steered = GoalDrive(config, GoalPlanner(graph, config, live.plan.motion), 0.05)
+    route = GoalRoute(steered, live, RememberedContacts(np.zeros((0, 3)), [], RECENT))
     arm = VirtualArm(live, surroundings(made), np.array([*cell_centre(LOOP[0]), 0.0]))
     frontend, random = Frontend(TOUCH), stream(5, "estimates")
     for _ in range(most):

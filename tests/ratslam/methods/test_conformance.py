@@ -15,7 +15,7 @@ from ratslam.methods.grid import GridOutcome
 from ratslam.methods.localise_grid import GridLocaliseOutcome
 from ratslam.methods.method_registry import BACKENDS
 from ratslam.places.localiser import Localisation
-from ratslam.service.backend_checks import CHECKS, CIRCUIT, BackendTrial
+from ratslam.service.backend_checks import CIRCUIT, BackendTrial
 
 
 def pose_cells(method, source, **more):
@@ -90,7 +90,7 @@ SELDOM = {"a batch equals its members": {EXAMPLE}, "single precision stays singl
 def cases():
     """Every backend with every check; the rare ones, and those of the backends in `OFTEN`, for the soak."""
     for name in [*METHODS, EXAMPLE]:
-        for check in CHECKS:
+        for check in BackendTrial.checks():
             rare = name not in SELDOM.get(check.name, {name})
             seldom = pytest.mark.soak if rare or name in OFTEN else ()
             yield pytest.param(name, check, id=f"{name}-{check.name}", marks=seldom)

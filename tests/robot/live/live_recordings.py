@@ -11,7 +11,8 @@ from robot.drivers.head.decoder import Cut, Frames, assemble_cycle
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
 from robot.recordings.mcap_reader import McapScanner, RecordingEntry
-from robot.sources.source import SourceInfo
+from robot.recordings.mcap_writer import Recorder
+from robot.sources.source import SourceDescription, SourceInfo
 from tactile.base.types import Cycle, Odometry
 from tactile.whisker_geometry import HeadConfig
 
@@ -64,7 +65,7 @@ def same_bits(one: Any, other: Any) -> bool:
 
 def open_recorder(path: Path) -> LiveRecorder:
     path.unlink(missing_ok=True)
-    return LiveRecorder(path, view_shape=(2, 2, 1), whiskers=W, rate_hz=1.0, info=INFO)
+    return LiveRecorder(Recorder(path, SourceDescription((2, 2, 1), W, 1.0, INFO)))
 
 
 def content(path: Path, kind: type) -> list[Any]:

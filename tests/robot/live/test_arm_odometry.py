@@ -85,4 +85,5 @@ def test_old_states_are_dropped():
     arm, *_ = odometer(LiveConfig(), 9.0, 0.05, 0.0)
     time, _, tcp, rate = arc(LiveConfig(), 20.0, 0.05, 0.0)
     arm.add(200.0 + time, tcp, rate)
-    assert 9.0 < arm.span <= 10.0
+    assert np.allclose(arm.pose(0.0), arm.pose(200.0 + time[-1] - 10.0))  # the oldest is as old as that
+    assert not np.allclose(arm.pose(0.0), arm.pose(200.0 + time[-1] - 9.9))

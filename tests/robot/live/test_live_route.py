@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.live.arm_route import approach_route, descent_route, main_route, plan_path
+from robot.live.arm_route import arm_routes, plan_path
 from robot.live.live_config import LiveConfig
 from robot.world.scene import make_scene, poses_at
 from tactile.base.errors import InputError
@@ -31,7 +31,7 @@ class StubArm:
 
 def test_each_target_is_sent_once_after_arrival_at_the_last():
     config = LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0), (0.2, 0.1, 90.0)))
-    route, arm = main_route(config, plan_path(config, HEAD)), StubArm()
+    route, arm = arm_routes(config, plan_path(config, HEAD))[2], StubArm()
     assert [route.advance(arm) for _ in range(3)] == [False] * 3
     assert len(arm.sent) == 1
     arm.there = True
@@ -47,7 +47,7 @@ def test_each_target_is_sent_once_after_arrival_at_the_last():
 
 def test_the_target_of_a_stopped_arm_is_sent_again():
     config = LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0)))
-    route, arm = main_route(config, plan_path(config, HEAD)), StubArm()
+    route, arm = arm_routes(config, plan_path(config, HEAD))[2], StubArm()
     route.resend_last()
     route.advance(arm)
     route.resend_last()
@@ -61,11 +61,11 @@ def test_the_path_is_that_of_the_simulated_session():
     plan, path = config.plan, plan_path(config, HEAD)
     scene = make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, HEAD, plan.seed)
     assert np.array_equal(path.pose, poses_at(scene.path, path.time))
-    pose, lift = config.arm.placing.pose_from_tcp(main_route(config, path).targets)
+    pose, lift = config.arm.placing.pose_from_tcp(arm_routes(config, path)[2].targets)
     assert np.allclose(pose[:, :2], path.pose[1:, :2])
     assert np.allclose(np.cos(pose[:, 2] - path.pose[1:, 2]), 1.0)
     assert np.allclose(lift, 0.0)
-    for route, height in ((approach_route(config, path), config.lift), (descent_route(config, path), 0.0)):
+    for route, height in zip(arm_routes(config, path), (config.lift, 0.0), strict=False):
         pose, lift = config.arm.placing.pose_from_tcp(route.targets)
         assert np.allclose(pose[0, :2], path.pose[0, :2])
         assert np.allclose(lift, height)
@@ -73,7 +73,7 @@ def test_the_path_is_that_of_the_simulated_session():
 
 def test_the_speed_is_the_lower_of_plan_and_arm():
     config = LiveConfig.model_validate({"arm": {"speed": 0.02}, "plan": {"motion": {"speed": 0.2}}})
-    assert main_route(config, plan_path(config, HEAD)).speed == 0.02
+    assert arm_routes(config, plan_path(config, HEAD))[2].speed == 0.02
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,8 @@ from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
 from robot.recordings.cdr import TRUTH, Event, decode, encode
 from robot.recordings.mcap_reader import McapScanner, Recording
+from robot.recordings.mcap_writer import Recorder
+from robot.sources.source import SourceDescription
 from tactile.base.errors import InputError
 from tactile.base.types import Cycle
 from tests.robot.live.live_recordings import (
@@ -284,6 +286,6 @@ def test_an_unseen_cut_needs_no_frames(tmp_path: Path, refused: Callable[..., In
     assert sample.reading.odometry == motion_of_whisk(0)
     assert isinstance(cut, Cut)
     refused(
-        lambda: LiveRecorder(tmp_path / "a.mcap", view_shape=(1, 1, 1), whiskers=1, info=INFO),
+        lambda: LiveRecorder(Recorder(tmp_path / "a.mcap", SourceDescription((1, 1, 1), 1, info=INFO))),
         "exists already",
     )

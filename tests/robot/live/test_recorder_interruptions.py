@@ -35,11 +35,12 @@ import numpy as np
 from robot.drivers.head.decoder import Frames
 from robot.drivers.head.decoder import Cut
 from robot.live.recorder import LiveRecorder
-from robot.sources.source import SourceInfo
+from robot.recordings.mcap_writer import Recorder
+from robot.sources.source import SourceDescription
 from tactile.base.types import Odometry
 
 path, beside = map(Path, sys.argv[1:])
-recorder = LiveRecorder(path, view_shape=(3, 6, 1), whiskers=18, info=SourceInfo())
+recorder = LiveRecorder(Recorder(path, SourceDescription((3, 6, 1), 18)))
 random = np.random.default_rng(0)
 pool = random.integers(-300, 300, (2000, 18, 3)).astype(np.int16)
 with beside.open("r+b") as file:

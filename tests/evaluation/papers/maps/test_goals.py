@@ -11,7 +11,7 @@ from evaluation.papers.maps.goals import GOALS, ClosedLoop, Drive, goal_figures,
 from evaluation.papers.maps.scenarios import Recipe, open_world, touch_config
 from evaluation.papers.maps.stored_maps import store_map
 from evaluation.papers.tables.touch_table import MAIN
-from robot.live.goal_drive import DriveState
+from ratslam.live.goal_drive import DriveState
 from robot.world.maze import cell_centre
 from tests.evaluation.papers.maps.stand_ins import cells_by_figure
 

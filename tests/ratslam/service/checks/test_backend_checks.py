@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import pytest
 
-from ratslam.service.backend_checks import CHECKS, BackendTrial
-from ratslam.service.check_results import run_checks
+from ratslam.service.backend_checks import BackendTrial
 from tactile.base.plugins import NoSettings
 from tests.ratslam.service.checks import broken_backends as broken
 from tests.ratslam.service.checks.broken_backends import entry_of
 
 
 def first_failure(entry):
-    results = run_checks(CHECKS, BackendTrial(entry, NoSettings()))
+    results = BackendTrial(entry, NoSettings()).run_checks()
     return next((result for result in results if result.status == "FAIL"), None)
 
 
 def test_a_sound_backend_passes():
-    results = list(run_checks(CHECKS, BackendTrial(entry_of(broken.Sound), NoSettings())))
+    results = list(BackendTrial(entry_of(broken.Sound), NoSettings()).run_checks())
     assert [result.line() for result in results if result.status != "ok"] == []
-    assert [result.check for result in results] == list(CHECKS)
+    assert [result.check for result in results] == list(BackendTrial.checks())
 
 
 CASES = {

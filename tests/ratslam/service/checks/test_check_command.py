@@ -9,10 +9,9 @@ from evaluation.metrics.metric_registry import METRICS, MetricEntry
 from ratslam.cli import main
 from ratslam.examples import dead_reckoning
 from ratslam.methods.method_registry import BACKENDS
-from ratslam.service import backend_checks as backend
-from ratslam.service import metric_checks as metric
-from ratslam.service import source_checks as source
-from ratslam.service import touch_checks as touch
+from ratslam.service.backend_checks import BackendTrial
+from ratslam.service.metric_checks import MetricTrial
+from ratslam.service.source_checks import SourceTrial, TouchTrial
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
@@ -70,8 +69,8 @@ def check(capsys, *arguments):
 def test_the_example_backend_passes(capsys):
     code, lines, _ = check(capsys, "backend", "example", "--set", "settings.scale=0.98")
     assert code == 0
-    assert [line.split(maxsplit=1)[0] for line in lines[:-1]] == ["ok"] * len(backend.CHECKS)
-    assert lines[-1] == f"example: {len(backend.CHECKS)} checks, 0 failed"
+    assert [line.split(maxsplit=1)[0] for line in lines[:-1]] == ["ok"] * len(BackendTrial.checks())
+    assert lines[-1] == f"example: {len(BackendTrial.checks())} checks, 0 failed"
 
 
 def test_a_broken_backend_is_told_why(capsys):
@@ -87,26 +86,26 @@ def test_a_broken_backend_is_told_why(capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "module"),
+    ("arguments", "trial"),
     [
-        (["source", "head", "--set", "settings.seed=3", "--samples", "50"], source),
-        (["source", "head", "--touch", "images", "--samples", "50"], source),
-        (["touch", "images"], touch),
-        (["touch", "images", "--source", "head", "--set", "source.seed=3"], touch),
-        (["metric", "steps", "--set", "settings.factor=2"], metric),
+        (["source", "head", "--set", "settings.seed=3", "--samples", "50"], SourceTrial),
+        (["source", "head", "--touch", "images", "--samples", "50"], SourceTrial),
+        (["touch", "images"], TouchTrial),
+        (["touch", "images", "--source", "head", "--set", "source.seed=3"], TouchTrial),
+        (["metric", "steps", "--set", "settings.factor=2"], MetricTrial),
     ],
     ids=["source", "source through a front end", "touch", "touch with a source", "metric"],
 )
-def test_other_parts_pass(capsys, arguments, module):
+def test_other_parts_pass(capsys, arguments, trial):
     code, lines, _ = check(capsys, *arguments)
-    assert (code, lines[-1]) == (0, f"{arguments[1]}: {len(module.CHECKS)} checks, 0 failed")
+    assert (code, lines[-1]) == (0, f"{arguments[1]}: {len(trial.checks())} checks, 0 failed")
 
 
 def test_a_source_that_cannot_be_opened_is_told_why(capsys):
     code, lines, _ = check(capsys, "source", "faulty")
     assert (code, lines[-1]) == (
         1,
-        f"faulty: {len(source.CHECKS)} checks, 1 failed, {len(source.CHECKS) - 2} not run",
+        f"faulty: {len(SourceTrial.checks())} checks, 1 failed, {len(SourceTrial.checks()) - 2} not run",
     )
     assert "ZeroDivisionError: division by zero at test_check_command.py" in lines[1]
 

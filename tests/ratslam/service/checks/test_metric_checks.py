@@ -10,8 +10,7 @@ import pytest
 from evaluation.metrics.metric import Finding, Metric
 from evaluation.metrics.metric_registry import MetricEntry
 from evaluation.metrics.run_metrics import RUN_METRICS
-from ratslam.service.check_results import run_checks
-from ratslam.service.metric_checks import CHECKS, MetricTrial
+from ratslam.service.metric_checks import MetricTrial
 from tactile.base.plugins import NoSettings
 
 
@@ -29,9 +28,9 @@ def trial_of(metric):
     ids=lambda one: one.name,
 )
 def test_our_metrics_pass(metric):
-    results = list(run_checks(CHECKS, trial_of(metric)))
+    results = list(trial_of(metric).run_checks())
     assert [result.line() for result in results if result.status != "ok"] == []
-    assert [result.check for result in results] == list(CHECKS)
+    assert [result.check for result in results] == list(MetricTrial.checks())
 
 
 def last_error(data):
@@ -84,10 +83,10 @@ BROKEN = {
 
 @pytest.mark.parametrize(("metric", "check", "words"), BROKEN.values(), ids=BROKEN)
 def test_a_broken_metric_is_told_what_is_wrong(metric, check, words):
-    failed = next(result for result in run_checks(CHECKS, trial_of(metric)) if result.status == "FAIL")
+    failed = next(result for result in trial_of(metric).run_checks() if result.status == "FAIL")
     assert (failed.check.name, words in failed.text) == (check, True), failed.line()
 
 
 def test_a_sound_metric_passes():
-    results = list(run_checks(CHECKS, trial_of(SOUND)))
+    results = list(trial_of(SOUND).run_checks())
     assert [result.line() for result in results if result.status != "ok"] == []

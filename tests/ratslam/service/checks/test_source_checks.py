@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ratslam.service.check_results import run_checks
-from ratslam.service.source_checks import CHECKS, SourceTrial
+from ratslam.service.source_checks import SourceTrial
 from robot.recordings import real_whiskers
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
@@ -54,9 +53,9 @@ OURS = {
 
 @pytest.mark.parametrize("trial", OURS.values(), ids=OURS)
 def test_our_sources_pass(trial):
-    results = list(run_checks(CHECKS, trial()))
+    results = list(trial().run_checks())
     assert [result.line() for result in results if result.status != "ok"] == []
-    assert [result.check for result in results] == list(CHECKS)
+    assert [result.check for result in results] == list(SourceTrial.checks())
 
 
 def memory():
@@ -156,15 +155,13 @@ BROKEN = {
 @pytest.mark.parametrize(("changes", "check", "words"), BROKEN.values(), ids=BROKEN)
 def test_a_broken_source_is_told_what_is_wrong(changes, check, words):
     trial = SourceTrial(SourceEntry(NoSettings, lambda *_: Changed(**changes)), NoSettings())
-    failed = next(result for result in run_checks(CHECKS, trial) if result.status == "FAIL")
+    failed = next(result for result in trial.run_checks() if result.status == "FAIL")
     assert (failed.check.name, words in failed.text) == (check, True), failed.line()
 
 
 def test_an_unstable_digest_is_told():
     entry = SourceEntry(NoSettings, lambda *_: replace(memory(), digest=f"{next(DIGESTS):064x}"))
-    failed = [
-        result for result in run_checks(CHECKS, SourceTrial(entry, NoSettings())) if result.status != "ok"
-    ]
+    failed = [result for result in SourceTrial(entry, NoSettings()).run_checks() if result.status != "ok"]
     assert [result.check.name for result in failed] == ["the digest identifies the input"]
 
 
@@ -176,7 +173,7 @@ def test_a_live_source_is_read_once():
         return sample
 
     entry = SourceEntry(NoSettings, lambda *_: Changed(once, digest="", length=None))
-    assert all(result.status == "ok" for result in run_checks(CHECKS, SourceTrial(entry, NoSettings())))
+    assert all(result.status == "ok" for result in SourceTrial(entry, NoSettings()).run_checks())
     assert passes == list(range(ROWS))
 
 
@@ -195,4 +192,4 @@ def test_readings_of_another_sensor_go_through_their_front_end(monkeypatch):
         NoSettings, lambda *_: Changed(lambda sample, k: sample._replace(reading=np.full(66, 0.5)))
     )
     trial = SourceTrial(entry, NoSettings(), PluginConfig(plugin="taxels"))
-    assert [result.line() for result in run_checks(CHECKS, trial) if result.status != "ok"] == []
+    assert [result.line() for result in trial.run_checks() if result.status != "ok"] == []

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ratslam.service.check_results import run_checks
-from ratslam.service.touch_checks import CHECKS, TouchTrial
+from ratslam.service.source_checks import TouchTrial
 from robot.simulation.create.simulated_session import CreateSimulation, CreateSimulationConfig
 from robot.touch_source import TouchEntry, report_config_of
 from tactile.base.plugins import NoSettings
@@ -35,9 +34,9 @@ OURS = {
 
 @pytest.mark.parametrize("trial", OURS.values(), ids=OURS)
 def test_our_front_ends_pass(trial):
-    results = list(run_checks(CHECKS, trial()))
+    results = list(trial().run_checks())
     assert [result.line() for result in results if result.status != "ok"] == []
-    assert [result.check for result in results] == list(CHECKS)
+    assert [result.check for result in results] == list(TouchTrial.checks())
 
 
 class Front:
@@ -127,21 +126,19 @@ BROKEN = {
 @pytest.mark.parametrize(("kind", "check", "words"), BROKEN.values(), ids=BROKEN)
 def test_a_broken_front_end_is_told_what_is_wrong(kind, check, words):
     trial = trial_of(lambda settings, info: kind())
-    failed = next(result for result in run_checks(CHECKS, trial) if result.status == "FAIL")
+    failed = next(result for result in trial.run_checks() if result.status == "FAIL")
     assert (failed.check.name, words in failed.text) == (check, True), failed.line()
 
 
 def test_a_sound_front_end_passes():
-    results = run_checks(CHECKS, trial_of(lambda settings, info: Front()))
+    results = trial_of(lambda settings, info: Front()).run_checks()
     assert [result.line() for result in results if result.status != "ok"] == []
 
 
 def test_one_front_end_for_all_passes_is_told():
     front = Front()
     failed = [
-        result
-        for result in run_checks(CHECKS, trial_of(lambda settings, info: front))
-        if result.status != "ok"
+        result for result in trial_of(lambda settings, info: front).run_checks() if result.status != "ok"
     ]
     assert [result.check.name for result in failed] == ["it keeps nothing between passes"]
     assert "one front end for two passes" in failed[0].text

@@ -86,3 +86,12 @@ def test_dropped_steps_leave_gaps_only(drawn):
     assert np.allclose(
         line, [[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]], atol=1e-6
     )  # step 3 stands at the next known pose
+
+
+def test_verdicts_are_told_once_and_an_accepted_one_that_falls_is_dropped(drawn):
+    verdicts = [[[0, 9, 0]], [[0, 9, 0]], [[0, 9, 1]], [[0, 9, 0]], np.zeros((0, 3))]
+    updates = [([step(k)], MapReport(np.array(one, int), None)) for k, one in enumerate(verdicts)]
+    told = drawn(*updates)("/judgements", "TextLog:text")
+    assert told == {
+        k: [f"step 9 with step 0: {word}"] for k, word in ((0, "open"), (2, "accepted"), (3, "dropped"))
+    }

@@ -1,10 +1,10 @@
-"""Whisker curves and verdicts."""
+"""Whisker curves."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ratslam.service.viewer_process import POINTS, VerdictLog, whisker_curves
+from ratslam.service.viewer_process import POINTS, whisker_curves
 from tactile.whisker_geometry import HeadConfig, shaft_points, ur10_head
 
 HEAD = ur10_head(HeadConfig())
@@ -34,16 +34,3 @@ def test_a_whisker_in_contact_ends_at_the_contact_and_leaves_its_base_as_at_rest
     assert np.allclose(curves[4, -1], [0.03, 0.04, 0.02], atol=1e-12)
     turns = [np.linalg.norm(np.cross(part / np.linalg.norm(part), HEAD.rest[4])) for part in parts(curves[4])]
     assert turns[0] < 0.5 * turns[-1]  # it bends away from its direction at rest
-
-
-def test_verdicts_are_told_once_and_an_accepted_one_that_falls_is_dropped():
-    log = VerdictLog()
-    assert [tuple(change) for change in log.changes(np.array([[0, 9, 0]]))] == [(0, 9, "open")]
-    assert log.changes(np.array([[0, 9, 0]])) == []
-    found = log.changes(np.array([[0, 9, 1], [1, 10, 1]]))
-    assert [tuple(change) for change in found] == [(0, 9, "accepted"), (1, 10, "accepted")]
-    assert [tuple(c) for c in log.changes(np.array([[0, 9, 0], [1, 10, -1]]))] == [
-        (0, 9, "dropped"),
-        (1, 10, "dropped"),
-    ]
-    assert log.changes(np.zeros((0, 3), int)) == []

@@ -10,10 +10,13 @@ from __future__ import annotations
 
 from enum import Enum
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
+from ratslam.live.goal_planner import RECENT, GoalPlanner
+from ratslam.places.contact_alignment import RememberedContacts, placed_points
+from ratslam.places.route import NoWay
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.arm_route import MovableArm
 from robot.live.live_config import GoalConfig, LiveConfig
@@ -47,30 +50,11 @@ class DriveState(Enum):
         return self not in (DriveState.DRIVING, DriveState.WAITING)
 
 
-class PlannedWay(NamedTuple):
-    """The answer of a planner: poses [K, 3] in the map, or None with the state and the reason."""
-
-    poses: np.ndarray | None
-    state: DriveState = DriveState.DRIVING
-    reason: str = ""
-
-
-class Planner(Protocol):
-    """Plans ways over driven ground."""
-
-    def plan(self, pose: np.ndarray, goal: int, obstacles: np.ndarray) -> PlannedWay:
-        """The way from a pose [3] to a goal (its number in the list), clear of obstacles [n, 2] m.
-
-        `DriveState.BLOCKED`: there is none. `DriveState.LOST`: the pose is away from driven ground.
-        """
-        ...
-
-
 class GoalDrive:
     """Drives to one goal after the other.
 
     Args:
-        cell: side of a pose cell, m. count: number of goals.
+        cell: side of a pose cell, m.
 
     Attributes:
         state: of the present goal, or the end. reason: of the last change. goal: number of the present goal.
@@ -79,13 +63,13 @@ class GoalDrive:
             from the way, m.
     """
 
-    def __init__(self, config: GoalConfig, planner: Planner, cell: float, count: int) -> None:
+    def __init__(self, config: GoalConfig, planner: GoalPlanner, cell: float) -> None:
         self.state, self.reason = DriveState.WAITING, ""
         self.goal = self.replans = 0
         self.target: np.ndarray | None = None
         self.way: np.ndarray | None = None
         self.obstacles = np.zeros((0, 2))
-        self._config, self._planner, self._count = config, planner, count
+        self.config, self._planner = config, planner
         self.off_way = config.off_way * cell
         self._missing = self._touched = 0
         self._returning, self._returns, self._unsure = False, 0, 0
@@ -94,10 +78,8 @@ class GoalDrive:
     @property
     def finished(self) -> bool:
         """Whether all goals are reached, or one cannot be."""
-        last = self.goal == self._count - 1
-        return self.state in (DriveState.BLOCKED, DriveState.LOST) or (
-            self.state is DriveState.REACHED and last
-        )
+        last = self.state is DriveState.REACHED and self.goal == len(self.config.to) - 1
+        return last or self.state in (DriveState.BLOCKED, DriveState.LOST)
 
     def next_goal(self) -> None:
         """Turns to the next goal; obstacles stay known."""
@@ -127,7 +109,7 @@ class GoalDrive:
             if not self._replan(pose):
                 return self.state
         if self._is_blocked(pose, points):
-            if self._touched < self._config.confirm:
+            if self._touched < self.config.confirm:
                 self.state, self.reason = DriveState.WAITING, "a contact on the way"
                 return self.state
             self._touched = 0
@@ -146,12 +128,12 @@ class GoalDrive:
 
     def _wait(self, reason: str) -> DriveState:
         self._missing += 1
-        lost = self._missing > self._config.patience
+        lost = self._missing > self.config.patience
         self.state, self.reason = DriveState.LOST if lost else DriveState.WAITING, reason
         return self.state
 
     def _replan(self, pose: np.ndarray) -> bool:
-        if self.replans == self._config.replans:
+        if self.replans == self.config.replans:
             self.state, self.reason = DriveState.BLOCKED, f"{self.replans} new ways were blocked too"
             return False
         self.replans += 1
@@ -159,22 +141,21 @@ class GoalDrive:
 
     def _plan(self, pose: np.ndarray) -> bool:
         """Plans a way; whether there is one."""
-        made = self._planner.plan(pose, self.goal, self.obstacles)
-        self.way = made.poses
-        if made.poses is not None:
-            # The way is joined beside its beginning, without the detour over its first poses.
-            way, first = made.poses, 0
-            count = int(np.searchsorted(_lengths(way), JOINED, side="right"))
-            if count >= 2:
-                off = [line_distances(pose[None, :2], way[k : k + 2, :2])[0] for k in range(count - 1)]
-                first = int(np.argmin(off)) + 1
-            self._legs = legs_of(np.vstack([[*pose[:2], way[first, 2]], way[first:]]))
-            return True
-        if made.state is DriveState.LOST:
-            self._wait(made.reason)
-        else:
-            self.state, self.reason = made.state, made.reason
-        return False
+        try:
+            self.way = way = self._planner.plan(pose, self.goal, self.obstacles)
+        except NoWay as error:
+            self.way, self.state, self.reason = None, DriveState.BLOCKED, str(error)
+            return False
+        if way is None:
+            self._wait(f"no experience within {self.config.farthest:g} m of the estimate")
+            return False
+        # The way is joined beside its beginning, without the detour over its first poses.
+        first, count = 0, int(np.searchsorted(_lengths(way), JOINED, side="right"))
+        if count >= 2:
+            off = [line_distances(pose[None, :2], way[k : k + 2, :2])[0] for k in range(count - 1)]
+            first = int(np.argmin(off)) + 1
+        self._legs = legs_of(np.vstack([[*pose[:2], way[first, 2]], way[first:]]))
+        return True
 
     def _end(self, pose: np.ndarray, sure: bool) -> DriveState:
         """At the end of a way: the goal is reached if the pose is sure; otherwise some of the way is driven
@@ -187,7 +168,7 @@ class GoalDrive:
             self.state, self.reason = DriveState.WAITING, "on the way again"
         elif sure:
             self.state, self.reason = DriveState.REACHED, ""
-        elif self._returns == self._config.returns:
+        elif self._returns == self.config.returns:
             self.state, self.reason = DriveState.LOST, "the goal's surroundings do not fit the map"
         elif self._unsure < UNSURE:
             self._unsure += 1
@@ -200,7 +181,7 @@ class GoalDrive:
 
     def _advance(self, pose: np.ndarray, sure: bool) -> DriveState:
         while self._legs and self._legs[0].is_passed(
-            pose, CORNER if len(self._legs) > 1 else self._config.tolerance
+            pose, CORNER if len(self._legs) > 1 else self.config.tolerance
         ):
             self._legs.pop(0)
         if not self._legs:
@@ -223,9 +204,9 @@ class GoalDrive:
         if count < len(line):
             share = (NEAR_WAY - done[count - 1]) / np.hypot(*(line[count] - line[count - 1]))
             line[count] = line[count - 1] + share * (line[count] - line[count - 1])
-        near = line_distances(points, line[: count + 1]) < self._config.standoff
+        near = line_distances(points, line[: count + 1]) < self.config.standoff
         self._touched = self._touched + 1 if near.any() else 0
-        if self._touched >= self._config.confirm:
+        if self._touched >= self.config.confirm:
             self.reason = "a contact on the way"
             self.obstacles = np.vstack([self.obstacles, points[near]])
         return bool(near.any())
@@ -234,12 +215,6 @@ class GoalDrive:
 def _lengths(way: np.ndarray) -> np.ndarray:
     """[K] length of a way [K, 2 or 3] up to each of its poses, m."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))])
-
-
-def _points_in_map(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """[n, 2] points in base_link, seen from a pose [3] in the map."""
-    points = np.asarray(points, float).reshape(-1, 2)
-    return compose(pose, np.column_stack([points, np.zeros(len(points))]))[:, :2]
 
 
 SCATTER = 0.02
@@ -313,8 +288,6 @@ OUTLIER = np.array([0.03, 0.03, 0.1])
 the errors of a mobile robot is wrong by up to 0.6 rad after a turn, until recall corrects it."""
 SETTLED = 5
 """Whisks after which differences are limited so."""
-RECENT = 8
-"""Whisks whose contacts are aligned with those of the map."""
 MOVED = 5
 """Consecutive whisks elsewhere after which the robot has been moved."""
 NEW = 0.04
@@ -323,40 +296,16 @@ SAME, SAME_TURN = 0.005, 0.03
 """Change of the target below which the present move goes on, m and rad."""
 
 
-class ContactMap(Protocol):
-    """Contacts remembered in a map."""
-
-    def align(self, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """The pose near a pose [3] in the map from which contacts [n, 2] in base_link (m) fit best."""
-        ...
-
-    def agrees(self, pose: np.ndarray, points: np.ndarray) -> bool:
-        """Whether contacts [n, 2] in base_link (m), seen from a pose [3] in the map, fit the map."""
-        ...
-
-
-class NoContacts(ContactMap):
-    """Those of a map without contacts: nothing is aligned or denied."""
-
-    def align(self, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-        del points
-        return pose
-
-    def agrees(self, pose: np.ndarray, points: np.ndarray) -> bool:
-        del pose, points
-        return True
-
-
 class GoalRoute:
     """Moves the arm as a drive decides; without a target it halts the arm.
 
     The map and the arm have frames of their own. The arm's own motion is far more accurate than one estimate:
     the pose to steer by moves with the arm and takes up a share of its difference to each estimate: 1 / n in
-    the n-th whisk, which is the mean of all, and at least `GAIN`. A difference of more than `jump` (m) in
+    the n-th whisk, which is the mean of all, and at least `GAIN`. A difference of more than `off_way` (m) in
     `MOVED` whisks is taken up at once: the robot is elsewhere; but contacts that agree with the map at the
     pose and not at the estimate deny it. Without estimates the arm's motion alone leads
     on for `coast` (m), as long as the contacts of the last whisks agree with the map; then the head rests. A
-    pose is sure if the estimate is within `jump` of it and the contacts agree.
+    pose is sure if the estimate is within `off_way` of it and the contacts agree.
 
     Args:
         contacts: those of the map, with which the last ones are aligned; recall does not do so.
@@ -365,20 +314,12 @@ class GoalRoute:
         drive: what decides. pose: [3] in the map to steer by; None before the first estimate.
     """
 
-    def __init__(
-        self,
-        drive: GoalDrive,
-        config: LiveConfig,
-        jump: float,
-        coast: float,
-        contacts: ContactMap | None = None,
-    ) -> None:
+    def __init__(self, drive: GoalDrive, config: LiveConfig, contacts: RememberedContacts) -> None:
         self.drive = drive
         self.pose: np.ndarray | None = None
-        self._placing, self._speed, self._jump = config.arm.placing, config.route_speed, jump
-        self._contacts = contacts or NoContacts()
+        self._placing, self._speed, self._contacts = config.arm.placing, config.route_speed, contacts
         self._recent: list[tuple[np.ndarray, np.ndarray]] = []  # arm's pose and contacts of the last whisks
-        self._coast, self._unseen = coast, 0.0  # way without an estimate, m
+        self._unseen = 0.0  # way without an estimate, m
         self._count = self._elsewhere = 0  # whisks since the last jump; of them in a row elsewhere
         self._arm_pose: np.ndarray | None = None  # in the whisk of that pose
         self._target: np.ndarray | None = None  # [3] by the arm
@@ -405,11 +346,11 @@ class GoalRoute:
         if estimate is not None and not self._correct(estimate, self._recent_points(arm_pose)):
             estimate = None
         sure = self.pose is not None and self._align(estimate, arm_pose)
-        if self.pose is None or (estimate is None and self._unseen > self._coast):
+        if self.pose is None or (estimate is None and self._unseen > self.drive.config.coast):
             self.pose = None
             return self.rest()
         now = compose(self.pose, between(arm_pose, arm_now))
-        state = self.drive.observe(now, _points_in_map(self.pose, points), sure)
+        state = self.drive.observe(now, placed_points(self.pose[None], [points]), sure)
         if self.drive.target is not None:
             self._target = compose(arm_now, between(now, self.drive.target))
         return state
@@ -426,23 +367,23 @@ class GoalRoute:
         self.pose = self._contacts.align(self.pose, points)
         # The map does not have the obstacles that were found on the way.
         found = self.drive.obstacles
-        away = np.linalg.norm(_points_in_map(self.pose, points)[:, None] - found, axis=-1)
+        away = np.linalg.norm(placed_points(self.pose[None], [points])[:, None] - found, axis=-1)
         agrees = self._contacts.agrees(self.pose, points[(away > NEW).all(axis=1)])
         if estimate is None:
             self._unseen = self._unseen if agrees else np.inf
             return False
-        return agrees and bool(np.hypot(*(self.pose - estimate)[:2]) <= self._jump)
+        return agrees and bool(np.hypot(*(self.pose - estimate)[:2]) <= self.drive.off_way)
 
     def _recent_points(self, arm_pose: np.ndarray) -> np.ndarray:
         """[n, 2] contacts of the last whisks, as seen from a pose of the arm, m."""
-        seen = [_points_in_map(between(arm_pose, before), points) for before, points in self._recent]
-        return np.concatenate(seen)
+        poses, points = zip(*self._recent, strict=True)
+        return placed_points(np.array([between(arm_pose, before) for before in poses]), points)
 
     def _correct(self, estimate: np.ndarray, points: np.ndarray) -> bool:
         """Moves the pose towards the estimate, unless only the pose as it is agrees with the last contacts
         [n, 2] in base_link, m; returns whether it did."""
         apart = np.zeros(3) if self.pose is None else between(self.pose, estimate)
-        self._elsewhere = self._elsewhere + 1 if np.hypot(apart[0], apart[1]) > self._jump else 0
+        self._elsewhere = self._elsewhere + 1 if np.hypot(apart[0], apart[1]) > self.drive.off_way else 0
         if self.pose is not None and self._elsewhere:
             here, there = (self._contacts.align(pose, points) for pose in (self.pose, estimate))
             if self._contacts.agrees(here, points) and not self._contacts.agrees(there, points):

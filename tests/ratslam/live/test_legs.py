@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robot.live.goal_drive import SCATTER, leg_heading, legs_of
+from ratslam.live.goal_drive import SCATTER, leg_heading, legs_of
 from tactile.base.se2 import line_distances
 
 

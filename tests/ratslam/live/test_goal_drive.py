@@ -7,24 +7,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ratslam.live.goal_drive import MOVED, DriveState, GoalDrive, GoalRoute
+from ratslam.live.goal_planner import RECENT
+from ratslam.places.contact_alignment import RememberedContacts
+from ratslam.places.route import NoWay
 from robot.drivers.ur10.safety import TargetRefused
-from robot.live.goal_drive import MOVED, ContactMap, DriveState, GoalDrive, GoalRoute, PlannedWay
 from robot.live.live_config import GoalConfig, LiveConfig
 
 WAY = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, np.pi / 2]])
 FREE = np.zeros((0, 2))
-CONFIG = GoalConfig(map=Path("map.npz"), to=(0, 1), patience=3, replans=2)
+CONFIG = GoalConfig(map=Path("map.npz"), to=(0, 1), patience=3, replans=2, coast=0.1)
 
 
 class StubPlanner:
     """Gives the ways of a list, one after the other, and remembers what it was asked."""
 
-    def __init__(self, *ways: PlannedWay) -> None:
+    def __init__(self, *ways: np.ndarray | NoWay | None) -> None:
         self.ways, self.asked = list(ways), []
 
     def plan(self, pose, goal, obstacles):
         self.asked.append((pose, goal, obstacles))
-        return self.ways.pop(0) if len(self.ways) > 1 else self.ways[0]
+        way = self.ways.pop(0) if len(self.ways) > 1 else self.ways[0]
+        if isinstance(way, NoWay):
+            raise way
+        return way
 
 
 class StubArm:
@@ -45,9 +51,9 @@ class StubArm:
         self.told.append("halt")
 
 
-def drive_on(*ways: PlannedWay) -> tuple[GoalDrive, StubPlanner]:
-    planner = StubPlanner(*(ways or (PlannedWay(WAY),)))
-    return GoalDrive(CONFIG, planner, 0.05, 2), planner
+def drive_on(*ways: np.ndarray | NoWay | None) -> tuple[GoalDrive, StubPlanner]:
+    planner = StubPlanner(*(ways or (WAY,)))
+    return GoalDrive(CONFIG, planner, 0.05), planner
 
 
 def at(x, y, heading=0.0, points=FREE) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +77,7 @@ def test_legs_are_driven_one_after_the_other_with_turns_on_the_spot():
 
 def test_a_contact_ahead_stops_at_once_and_blocks_when_confirmed():
     ahead, beside = [[0.15, 0.02]], [[0.15, 0.08]]
-    drive, planner = drive_on(PlannedWay(WAY), PlannedWay(None, DriveState.BLOCKED, "no other way"))
+    drive, planner = drive_on(WAY, NoWay("no other way"))
     assert drive.observe(*at(0.0, 0.0, points=beside)) is DriveState.DRIVING
     assert drive.observe(*at(0.02, 0.0, points=ahead)) is DriveState.WAITING
     assert drive.target is None
@@ -97,8 +103,7 @@ def test_without_estimates_the_robot_rests_and_is_lost_in_the_end():
         assert drive.observe(None, FREE) is DriveState.WAITING
         assert drive.target is None
     assert drive.observe(None, FREE) is DriveState.LOST
-    off_map = PlannedWay(None, DriveState.LOST, "no experience near")
-    drive, _ = drive_on(off_map)
+    drive, _ = drive_on(None)
     ends = [drive.observe(*at(5.0, 5.0)) for _ in range(CONFIG.patience + 1)]
     assert ends[-1] is DriveState.LOST
     assert DriveState.LOST not in ends[:-1]
@@ -113,8 +118,8 @@ def test_a_robot_that_is_elsewhere_gets_a_new_way():
     assert len(planner.asked) == 2
 
 
-def route_of(drive: GoalDrive, coast: float = 0.1) -> GoalRoute:
-    return GoalRoute(drive, LiveConfig(), drive.off_way, coast)
+def route_of(drive: GoalDrive) -> GoalRoute:
+    return GoalRoute(drive, LiveConfig(), RememberedContacts(np.zeros((0, 3)), [], RECENT))
 
 
 def test_the_arm_is_moved_and_halted_as_the_drive_decides():
@@ -134,7 +139,7 @@ def test_the_arm_is_moved_and_halted_as_the_drive_decides():
 
 def test_a_lost_method_coasts_by_the_arm_for_a_while():
     drive, _ = drive_on()
-    route, start = route_of(drive, coast=0.1), np.zeros(3)
+    route, start = route_of(drive), np.zeros(3)
     route.see(start, FREE, start, start)
     moved = np.array([0.08, 0.0, 0.0])
     assert route.see(None, FREE, moved, moved) is DriveState.DRIVING
@@ -156,7 +161,7 @@ def test_single_wild_estimates_are_ignored_but_a_moved_robot_is_believed():
 
 
 def test_a_refused_target_blocks_the_way_there():
-    drive, planner = drive_on(PlannedWay(WAY), PlannedWay(None, DriveState.BLOCKED, "no other way"))
+    drive, planner = drive_on(WAY, NoWay("no other way"))
     route, pose = route_of(drive), np.zeros(3)
     route.see(pose, FREE, pose, pose)
     route.advance(StubArm(refuses=True))
@@ -179,7 +184,7 @@ def test_a_goal_is_reached_only_by_a_sure_pose():
     assert DriveState.DRIVING in ends, "some of the way is driven again before"
 
 
-class Known(ContactMap):
+class Known:
     """A map with which contacts agree near one pose."""
 
     def __init__(self, x: float) -> None:
@@ -195,7 +200,7 @@ class Known(ContactMap):
 @pytest.mark.parametrize(("truth", "believed"), [(0.0, False), (0.5, True)])
 def test_contacts_decide_between_the_pose_and_an_estimate_elsewhere(truth, believed):
     drive, _ = drive_on()
-    route = GoalRoute(drive, LiveConfig(), drive.off_way, 0.1, Known(truth))
+    route = GoalRoute(drive, LiveConfig(), Known(truth))
     here, there = np.zeros(3), np.array([0.5, 0.0, 0.0])
     for estimate in [here] * 3 + [there] * (MOVED + 1):
         route.see(estimate, FREE, here, here)
@@ -219,7 +224,7 @@ def test_a_robot_without_a_place_rests_until_it_is_found_or_lost():
 def test_contacts_that_do_not_fit_are_not_a_goal():
     end = np.array([0.2, 0.2, np.pi / 2])
     for truth, states in ((5.0, False), (0.2, True)):
-        drive, _ = drive_on(PlannedWay(WAY[-1:]))
-        route = GoalRoute(drive, LiveConfig(), drive.off_way, 0.1, Known(truth))
+        drive, _ = drive_on(WAY[-1:])
+        route = GoalRoute(drive, LiveConfig(), Known(truth))
         found = [route.see(end, FREE, end, end) for _ in range(4)]
         assert (DriveState.REACHED in found) == states
