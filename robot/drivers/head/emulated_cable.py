@@ -61,7 +61,7 @@ class UsbConnection:
         try:
             self._socket = socket.create_connection((host, port), PATIENCE)
         except OSError:
-            raise _no_device() from None
+            raise usb_error(errno.ENODEV) from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def call(
@@ -92,9 +92,9 @@ class UsbConnection:
                 got = self._exactly(length)
             except OSError:
                 self._socket.close()  # a late answer would be read as that of the next request
-                raise _no_device() from None
+                raise usb_error(errno.ENODEV) from None
         if status:
-            raise OSError(-status, os.strerror(-status))
+            raise usb_error(-status)
         return got
 
     def close(self) -> None:
@@ -108,15 +108,15 @@ class UsbConnection:
         while size:
             part = self._socket.recv(size)
             if not part:
-                raise _no_device()
+                raise usb_error(errno.ENODEV)
             parts.append(part)
             size -= len(part)
         return b"".join(parts)
 
 
-def _no_device() -> OSError:
-    """The error of a transfer to a disconnected device."""
-    return OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+def usb_error(number: int) -> OSError:
+    """The error of a transfer, by its errno."""
+    return OSError(number, os.strerror(number))
 
 
 T = TypeVar("T")

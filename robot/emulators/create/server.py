@@ -20,13 +20,12 @@ from typing import Any
 import numpy as np
 
 from robot.drivers.create.protocol import BAUD, Bumps
-from robot.drivers.head.usb_protocol import Command
 from robot.drivers.processes import urgent
 from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig
 from robot.emulators.create.robot import EmulatedCreate
 from robot.emulators.head.emulated_device import EmulatedHead
 from robot.emulators.head.server import open_server
-from robot.emulators.head.whiskers import Block, block_samples
+from robot.emulators.head.whiskers import Block, SensorArray, block_samples
 from robot.simulation.create.strain_sensors import (
     BodyVibration,
     base_strains,
@@ -303,7 +302,7 @@ def _read_requests(server: _CreateServer) -> None:
     threading.Thread(target=read, daemon=True, name="requests").start()
 
 
-class CreateWhiskers:
+class CreateWhiskers(SensorArray):
     """The whiskers of a Create as a `SensorArray`: angles are 0, deflections the two strains.
 
     Args:
@@ -329,13 +328,6 @@ class CreateWhiskers:
     def count(self) -> int:
         return len(self._fan.base)
 
-    @property
-    def resting(self) -> bool:
-        return True
-
-    def begin(self, time: float) -> None:
-        """The robot moves by its own commands."""
-
     def block(self, start: float, end: float) -> Block:
         self._move(end)
         before, self._pose = self._pose, self._robot.pose
@@ -358,12 +350,6 @@ class CreateWhiskers:
 
     def skip_block(self) -> None:
         self._pose = self._robot.pose
-
-    def receive(self, command: Command, now: float) -> None:
-        """Fixed whiskers have no drives."""
-
-    def stop(self) -> None:
-        """Fixed whiskers have no drives."""
 
     def state(self, now: float) -> dict[str, Any]:
         return {"pose": self._robot.pose.tolist(), "side": self._side.tolist()}

@@ -22,9 +22,7 @@ from robot.drivers.head.usb_protocol import (
 from robot.drivers.ur10.driver_config import BaseTransformConfig
 from robot.drivers.ur10.rtde_protocol import PoseListener
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
-from robot.simulation.head.baseline import Baseline, make_baseline
-from robot.simulation.head.beam import StreamConfig
-from robot.simulation.head.kinematic import MechanicsConfig
+from robot.simulation.head.baseline import make_baseline
 from robot.simulation.head.whisk_stream import (
     WallSweep,
     WhiskerBalance,
@@ -64,7 +62,7 @@ class Block(NamedTuple):
 
 
 class SensorArray(Protocol):
-    """Simulated whiskers, moved by drives or fixed. Times are the host's monotonic clock, s."""
+    """Simulated whiskers; fixed ones have no drives. Times are the host's monotonic clock, s."""
 
     @property
     def count(self) -> int:
@@ -74,11 +72,10 @@ class SensorArray(Protocol):
     @property
     def resting(self) -> bool:
         """Whether all drives rest, so that blocks nobody reads need not be made."""
-        ...
+        return True
 
     def begin(self, time: float) -> None:
         """The stream of samples starts."""
-        ...
 
     def block(self, start: float, end: float) -> Block:
         """The samples between two times."""
@@ -86,15 +83,12 @@ class SensorArray(Protocol):
 
     def skip_block(self) -> None:
         """Skips a block without samples or motion."""
-        ...
 
     def receive(self, command: Command, now: float) -> None:
         """Executes a command."""
-        ...
 
     def stop(self) -> None:
         """Retracts the whiskers and stops the drives."""
-        ...
 
     def state(self, now: float) -> dict[str, Any]:
         """Pose and activity, as JSON values."""
@@ -105,29 +99,21 @@ STEP = 1e-4
 """Resolution of lifts, m; an arm at working height stays within it."""
 
 
-class Whiskers:
-    """The whiskers with their state between blocks, and the walls.
+class Whiskers(SensorArray):
+    """The whiskers of an emulated head with their state between blocks, among the walls of its maze.
 
     Attributes:
         drives: the drives, which receive commands. pose, lift: of the head at the end of the last block.
     """
 
-    def __init__(
-        self,
-        config: StreamConfig,
-        mechanics: MechanicsConfig,
-        head: Head,
-        walls: Walls,
-        place: PoseSource,
-        random: np.random.Generator,
-        samples: int,
-        baseline: Baseline | None = None,
-    ) -> None:
-        self.config, self.mechanics, self.head = config, mechanics, head
-        self.baseline = baseline
-        self.walls, self.place, self.random, self.samples = walls, place, random, samples
-        self.drives = _ServoDrives(head, config.rate)
-        self.balance = whiskers_at_rest(1, len(head.length))
+    def __init__(self, config: HeadEmulatorConfig, walls: Walls, place: PoseSource) -> None:
+        rate, mechanics, head = config.stream.rate, config.mechanics, ur10_head(config.head)
+        self.config, self.mechanics, self.head = config.stream, mechanics, head
+        self.walls, self.place, self.random = walls, place, stream(config.seed, "sensor")
+        self.samples = block_samples(rate)
+        self.baseline = make_baseline(mechanics.baseline, mechanics.noise, rate, self.count, config.seed)
+        self.drives = _ServoDrives(head, rate)
+        self.balance = whiskers_at_rest(1, self.count)
         self.pose: np.ndarray | None = None
         self.lift = np.inf
         self._around: Surroundings | None = None
@@ -154,7 +140,6 @@ class Whiskers:
         self.drives.stop()
 
     def state(self, now: float) -> dict[str, Any]:
-        """Pose and activity, as JSON values."""
         whisk = self.drives.whisk
         pose, lift = self.place.at(now)
         doing = {} if whisk is None else whisk.whisking.model_dump() | {"amplitude": whisk.amplitude.tolist()}
@@ -167,11 +152,9 @@ class Whiskers:
         }
 
     def skip_block(self) -> None:
-        """Skips a block without samples or motion."""
         self.pose = None
 
     def block(self, start: float, end: float) -> Block:
-        """The samples between two times, s, host's monotonic clock."""
         rate, size = self.config.rate, self.samples
         if self.pose is None:
             self.pose, self.lift = self.place.at(start)
@@ -198,7 +181,7 @@ class Whiskers:
                     self._around, self._lowered = Surroundings(lower, self.head), lift
                 sweep = sweep_walls(self._around, pose, knots, time, some)
             else:
-                nothing = np.zeros((len(time), 1, len(self.head.length)))
+                nothing = np.zeros((len(time), 1, self.count))
                 sweep = WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, some)
             truth, self.balance = advance_balance(
                 self.config, self.mechanics, self.drives.law, sweep, self.balance
@@ -208,21 +191,6 @@ class Whiskers:
             done += count
         angle, deflection = (np.concatenate([part[k][0] for part in parts]) for k in range(2))
         return Block(angle, deflection, begins, bool((self.balance.drive.most > 0).any()))
-
-
-def maze_whiskers(config: HeadEmulatorConfig, walls: Walls, place: PoseSource) -> Whiskers:
-    """The whiskers of an emulated head among the walls of its maze."""
-    rate, mechanics, head = config.stream.rate, config.mechanics, ur10_head(config.head)
-    return Whiskers(
-        config.stream,
-        mechanics,
-        head,
-        walls,
-        place,
-        stream(config.seed, "sensor"),
-        block_samples(rate),
-        make_baseline(mechanics.baseline, mechanics.noise, rate, len(head.length), config.seed),
-    )
 
 
 RETRACTION = 0.2
@@ -368,18 +336,6 @@ AHEAD = 0.1
 """Longest extrapolation of a pose by the arm's speed, s; after that the head stands still."""
 
 
-class PoseSource(Protocol):
-    """Pose of the head over time."""
-
-    def at(self, time: float) -> tuple[np.ndarray, float]:
-        """Pose in the map [3] (m, m, rad) and lift above working height, m.
-
-        Args:
-            time: s, host's monotonic clock.
-        """
-        ...
-
-
 class CarriedByArm:
     """The newest pose of an arm, extrapolated by its speed."""
 
@@ -412,3 +368,8 @@ class AlongPath:
     def at(self, time: float) -> tuple[np.ndarray, float]:
         since = 0.0 if self.began is None else time - self.began
         return poses_at(self.path, np.array(since)), 0.0
+
+
+PoseSource = CarriedByArm | AlongPath
+"""The pose of the head in the map [3] (m, m, rad) and its lift above working height, m, at a time, s, of the
+host's monotonic clock."""
