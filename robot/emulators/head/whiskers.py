@@ -6,7 +6,7 @@ or at the end of the previous whisk. The head stands, moves along a path or is c
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -61,13 +61,13 @@ class Block(NamedTuple):
     fed_back: bool
 
 
-class SensorArray(Protocol):
+class SensorArray:
     """Simulated whiskers; fixed ones have no drives. Times are the host's monotonic clock, s."""
 
     @property
     def count(self) -> int:
         """Number of whiskers."""
-        ...
+        raise NotImplementedError
 
     @property
     def resting(self) -> bool:
@@ -79,7 +79,7 @@ class SensorArray(Protocol):
 
     def block(self, start: float, end: float) -> Block:
         """The samples between two times."""
-        ...
+        raise NotImplementedError
 
     def skip_block(self) -> None:
         """Skips a block without samples or motion."""
@@ -92,7 +92,7 @@ class SensorArray(Protocol):
 
     def state(self, now: float) -> dict[str, Any]:
         """Pose and activity, as JSON values."""
-        ...
+        raise NotImplementedError
 
 
 STEP = 1e-4
