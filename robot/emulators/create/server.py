@@ -339,7 +339,10 @@ class CreateWhiskers(SensorArray):
         self._side = bent.side[-1]
         changed, self._changes = self._changes != len(self._robot.speeds), len(self._robot.speeds)
         rolls = bool(self._robot.right or self._robot.left)
-        shake = self._shaking.advance(self._samples, rolls=rolls, starts=changed and rolls)
+        if changed and rolls:
+            self._shaking.start()
+        rumble = self._shaking.rumble(self._samples, rolls)
+        shake = self._shaking.ring(self._samples) + rumble
         strain = base_strains(self.config.whiskers, self._fan, bent) + shake[:, None]
         strain += self.config.whiskers.noise * self._random.standard_normal(strain.shape)
         strain = np.where(self._fan.alive[:, None], strain, 0.0)

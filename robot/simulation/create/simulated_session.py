@@ -282,7 +282,9 @@ class CreateRobot:
         if len(near):
             gap = segment_distance(near, np.vstack([last.pose, poses])[:, :2]).min(axis=1)
             bumped = (gap[1:] < config.body) & (np.diff(gap) < 0)
-        row, moment = motion_end(config, state, known, bumped, last.contact)
+        end = motion_end(config, state, known, bumped, last.contact, count - 1)
+        assert end is not None
+        row, moment = end
         duration = float(time[row])
         return CreateStep(
             state,

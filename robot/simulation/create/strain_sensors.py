@@ -72,44 +72,6 @@ def shaft_tilt(shaft: Shaft, reach: np.ndarray) -> np.ndarray:
     return (3 - 2 * narrow) / (2 * (1 - narrow))
 
 
-def bend_shafts(
-    shaft: Shaft, base: np.ndarray, direction: np.ndarray, segments: np.ndarray, side: np.ndarray
-) -> Bending:
-    """Bending of whiskers among walls.
-
-    Args:
-        base: [T, W, 2] positions of the bases in order of time, m. direction: [T, W] of straight shafts, rad.
-        segments: [S, 4] m. side: [W] as in `Bending`, before the first row.
-    """
-    free, no_side = np.zeros(direction.shape), np.zeros(direction.shape, int)
-    nothing = Bending(free, free + shaft.length, free, no_side)
-    if not len(segments):
-        return nothing
-    low, high = _blocked_ends(shaft, base, direction, segments)
-    blocked = np.any((low.angle < 0) & (high.angle > 0), axis=-1)
-    if not blocked.any():
-        return nothing
-    row, whisker = np.nonzero(blocked)
-    low, high = (_Ends(*(column[row, whisker] for column in ends)) for ends in (low, high))
-    left = _free_ends(low, high)
-    right = _free_ends(high._replace(angle=-high.angle), low._replace(angle=-low.angle))
-    easier = no_side.copy()
-    easier[row, whisker] = np.where(left.angle <= right.angle, 1, -1)
-    # A whisker bends to the easier side at first contact, and to the same side as long as it is blocked.
-    was = np.vstack([side != 0, blocked[:-1]])
-    rows = np.arange(len(blocked))[:, None]
-    onset = np.maximum.accumulate(np.where(blocked & ~was, rows, -1), axis=0)
-    since = np.where(onset >= 0, np.take_along_axis(easier, np.maximum(onset, 0), axis=0), side)
-    sides = np.where(blocked, since, 0)
-    way = sides[row, whisker]
-    chosen = _Ends(*(np.where(way > 0, a, b) for a, b in zip(left, right, strict=True)))
-    turn, reach, lean = (free.copy() for _ in range(3))
-    reach += shaft.length
-    angle, reach[row, whisker], lean[row, whisker] = _solve_contacts(shaft, chosen)
-    turn[row, whisker] = way * angle
-    return Bending(turn, reach, lean, sides)
-
-
 class _Ends(NamedTuple):
     """One end of the range of angles in which a wall blocks a whisker: the angle, rad; the distance of the
     contact from the base, m; the distances of the nearest reachable point of the wall and of the wall's
@@ -289,11 +251,43 @@ def fixed_whiskers(config: WhiskersConfig) -> FixedWhiskers:
 
 
 def bend_whiskers(fan: FixedWhiskers, pose: np.ndarray, segments: np.ndarray, side: np.ndarray) -> Bending:
-    """Bending of whiskers at poses [T, 3] in order of time among walls [S, 4]; `side` as in `bend_shafts`."""
+    """Bending of whiskers among walls.
+
+    Args:
+        pose: [T, 3] of the body in order of time, m, m, rad. segments: [S, 4] m. side: [W] as in `Bending`,
+            before the first row.
+    """
     c, s = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
     x, y = fan.base.T
     base = np.stack([pose[:, :1] + c * x - s * y, pose[:, 1:2] + s * x + c * y], axis=-1)
-    return bend_shafts(fan.shaft, base, pose[:, 2:] + fan.direction, segments, side)
+    direction = pose[:, 2:] + fan.direction
+    free, no_side = np.zeros(direction.shape), np.zeros(direction.shape, int)
+    nothing = Bending(free, free + fan.shaft.length, free, no_side)
+    if not len(segments):
+        return nothing
+    low, high = _blocked_ends(fan.shaft, base, direction, segments)
+    blocked = np.any((low.angle < 0) & (high.angle > 0), axis=-1)
+    if not blocked.any():
+        return nothing
+    row, whisker = np.nonzero(blocked)
+    low, high = (_Ends(*(column[row, whisker] for column in ends)) for ends in (low, high))
+    left = _free_ends(low, high)
+    right = _free_ends(high._replace(angle=-high.angle), low._replace(angle=-low.angle))
+    easier = no_side.copy()
+    easier[row, whisker] = np.where(left.angle <= right.angle, 1, -1)
+    # A whisker bends to the easier side at first contact, and to the same side as long as it is blocked.
+    was = np.vstack([side != 0, blocked[:-1]])
+    rows = np.arange(len(blocked))[:, None]
+    onset = np.maximum.accumulate(np.where(blocked & ~was, rows, -1), axis=0)
+    since = np.where(onset >= 0, np.take_along_axis(easier, np.maximum(onset, 0), axis=0), side)
+    sides = np.where(blocked, since, 0)
+    way = sides[row, whisker]
+    chosen = _Ends(*(np.where(way > 0, a, b) for a, b in zip(left, right, strict=True)))
+    turn, reach, lean = (free.copy() for _ in range(3))
+    reach += fan.shaft.length
+    angle, reach[row, whisker], lean[row, whisker] = _solve_contacts(fan.shaft, chosen)
+    turn[row, whisker] = way * angle
+    return Bending(turn, reach, lean, sides)
 
 
 def base_strains(config: WhiskersConfig, fan: FixedWhiskers, bent: Bending) -> np.ndarray:
@@ -305,74 +299,51 @@ def base_strains(config: WhiskersConfig, fan: FixedWhiskers, bent: Bending) -> n
     return np.stack([across, config.crosstalk * across - down], axis=-1) * fan.alive[:, None]
 
 
-def body_vibration(config: ShakeConfig, count: int, rate: float, random: np.random.Generator) -> np.ndarray:
-    """Horizontal and vertical strain [T, 2] from vibration of the body, from the start of a motion."""
-    from scipy.signal import lfilter  # slow to import
-
-    amplitude, phase = _draw_ringing(config, random)
-    ringing = _ringing(config, amplitude, phase, np.arange(count) / rate)
-    back = _resonance(config, rate)
-    lead = int(5 * config.decay * rate)  # until the transient has decayed
-    rumble = lfilter([1.0], back, random.standard_normal((lead + count, 2)), axis=0)[lead:]
-    return ringing + config.rumble / _gain(back) * rumble
-
-
 class BodyVibration:
-    """`body_vibration` of a robot that starts, rolls and stops, block by block."""
+    """Strain from vibration of the body, block by block: it rings from the start of a motion on, and its
+    wheels rumble while they roll."""
 
     def __init__(self, config: ShakeConfig, rate: float, random: np.random.Generator) -> None:
         self._config, self._rate, self._random = config, rate, random
-        self._back = _resonance(config, rate)
+        pole = np.exp((-1 / config.decay + 2j * np.pi * config.frequency) / rate)
+        a, b = -2 * pole.real, abs(pole) ** 2
+        self._back = [1.0, a, b]  # recursive coefficients of the resonance
+        # Standard deviation of the resonance driven by unit noise.
+        self._gain = float(np.sqrt((1 + b) / ((1 - b) * ((1 + b) ** 2 - a**2))))
         self._state = np.zeros((2, 2))
         self._since = 0  # samples since the last start
         self._amplitude = self._phase = np.zeros(2)
 
-    def advance(self, count: int, *, rolls: bool, starts: bool) -> np.ndarray:
-        """The next [T, 2] strains.
+    def start(self) -> None:
+        """Starts a motion."""
+        self._since = 0
+        self._amplitude = self._config.start * self._random.standard_normal(2)
+        self._phase = self._random.uniform(0, 2 * np.pi, 2)
 
-        Args:
-            rolls: whether the wheels turn. starts: whether a motion has started.
-        """
-        from scipy.signal import lfilter  # slow to import
-
-        if starts:
-            self._since = 0
-            self._amplitude, self._phase = _draw_ringing(self._config, self._random)
+    def ring(self, count: int) -> np.ndarray:
+        """The next [T, 2] horizontal and vertical strains of ringing."""
         time = (self._since + np.arange(count)) / self._rate
         self._since += count
+        damped, turned = np.exp(-time / self._config.decay), 2 * np.pi * self._config.frequency * time
+        return self._amplitude * damped[:, None] * np.sin(turned[:, None] + self._phase)
+
+    def rumble(self, count: int, rolls: bool = True) -> np.ndarray:
+        """The next [T, 2] strains of rumble, which goes on when the wheels no longer roll."""
+        from scipy.signal import lfilter  # slow to import
+
         drive = self._random.standard_normal((count, 2)) * rolls
         rumble, self._state = lfilter([1.0], self._back, drive, axis=0, zi=self._state)
-        ringing = _ringing(self._config, self._amplitude, self._phase, time)
-        return ringing + self._config.rumble / _gain(self._back) * rumble
-
-
-def _draw_ringing(config: ShakeConfig, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitude and phase [2] of the vibration at the start of a motion."""
-    return config.start * random.standard_normal(2), random.uniform(0, 2 * np.pi, 2)
-
-
-def _ringing(config: ShakeConfig, amplitude: np.ndarray, phase: np.ndarray, time: np.ndarray) -> np.ndarray:
-    damped = np.exp(-time / config.decay)
-    return amplitude * damped[:, None] * np.sin(2 * np.pi * config.frequency * time[:, None] + phase)
-
-
-def _resonance(config: ShakeConfig, rate: float) -> list[float]:
-    """Recursive coefficients of the resonance at a sample rate, Hz."""
-    pole = np.exp((-1 / config.decay + 2j * np.pi * config.frequency) / rate)
-    return [1.0, -2 * pole.real, abs(pole) ** 2]
-
-
-def _gain(back: list[float]) -> float:
-    """Standard deviation of a second-order resonance driven by unit noise."""
-    _, a, b = back
-    return float(np.sqrt((1 + b) / ((1 - b) * ((1 + b) ** 2 - a**2))))
+        return self._config.rumble / self._gain * rumble
 
 
 def sample_strain(
     config: WhiskersConfig, strain: np.ndarray, alive: np.ndarray, random: np.random.Generator
 ) -> np.ndarray:
     """Sensor readings [T, W, 2] of strain [T, W, 2] at the sensor rate, from the start of a motion."""
-    shake = body_vibration(config.shake, len(strain), config.rate, random)
+    shaking = BodyVibration(config.shake, config.rate, random)
+    shaking.start()
+    shaking.rumble(int(5 * config.shake.decay * config.rate))  # until the transient has decayed
+    shake = shaking.ring(len(strain)) + shaking.rumble(len(strain))
     read = strain + shake[:, None] + config.noise * random.standard_normal(strain.shape)
     return np.where(alive[:, None], read, 0.0)
 

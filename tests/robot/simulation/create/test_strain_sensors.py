@@ -15,9 +15,7 @@ from robot.simulation.create.strain_sensors import (
     WhiskersConfig,
     base_strain,
     base_strains,
-    bend_shafts,
     bend_whiskers,
-    body_vibration,
     fixed_whiskers,
     sample_strain,
     shaft_tilt,
@@ -40,6 +38,10 @@ def arena_and_poses(seed: int) -> tuple[Arena, np.ndarray]:
     poses = random.uniform([0, 0, -np.pi], [1.25, 1.25, np.pi], (4000, 3))
     near = segment_distance(wall_segments(room), poses[:, :2]).min(axis=1) < 0.25
     return room, poses[near & room.has_clearance(poses[:, :2], 0.17)][:50]
+
+
+ONE = FAN._replace(base=np.zeros((1, 2)), direction=np.zeros(1))
+"""A whisker ahead, at the origin of the body."""
 
 
 def each(poses: np.ndarray, walls: np.ndarray) -> Bending:
@@ -146,13 +148,11 @@ def test_a_motion_may_be_computed_in_parts(seed: int, cut: int) -> None:
 
 def test_a_whisker_stays_on_its_side() -> None:
     """A wall first straight across, then tilted to the other side."""
-    base, direction = np.zeros((40, 1, 2)), np.zeros((40, 1))
     tips = np.radians(np.linspace(85, 95, 40))
     turns = [
-        bend_shafts(
-            FAN.shaft,
-            base[:1],
-            direction[:1],
+        bend_whiskers(
+            ONE,
+            np.zeros((1, 3)),
             np.array([[0.13 - np.cos(a), -np.sin(a), 0.13 + np.cos(a), np.sin(a)]]),
             np.array([side]),
         ).turn[0, 0]
@@ -163,16 +163,16 @@ def test_a_whisker_stays_on_its_side() -> None:
     assert (np.array(turns[40:]) < 0).all()
     # Turned on the spot before one wall, from one side of the perpendicular to the other.
     wall = np.array([[0.13, -1.0, 0.13, 1.0]])
-    bend = bend_shafts(FAN.shaft, base, np.linspace(0.1, -0.1, 40)[:, None], wall, np.zeros(1, int))
-    assert (bend.side == 1).all()
-    assert bend_shafts(FAN.shaft, base[:1], -np.full((1, 1), 0.1), wall, np.zeros(1, int)).side[0, 0] == -1
+    turned = np.column_stack([np.zeros((40, 2)), np.linspace(0.1, -0.1, 40)])
+    assert (bend_whiskers(ONE, turned, wall, np.zeros(1, int)).side == 1).all()
+    assert bend_whiskers(ONE, turned[-1:], wall, np.zeros(1, int)).side[0, 0] == -1
 
 
 def test_contact_with_a_tip_a_shaft_and_a_corner() -> None:
     wall = np.array([[-1.0, 0.0, 1.0, 0.0]])
     height = np.linspace(0.0999, 0.02, 400)  # of the base above the wall, seen at 45 degrees
-    base = np.stack([np.zeros(400), height], axis=1)[:, None]
-    bend = bend_shafts(FAN.shaft, base, np.full((400, 1), -np.pi / 4), wall, np.zeros(1, int))
+    poses = np.column_stack([np.zeros(400), height, np.full(400, -np.pi / 4)])
+    bend = bend_whiskers(ONE, poses, wall, np.zeros(1, int))
     turn, reach = bend.turn[:, 0], bend.reach[:, 0]
     touching = turn != 0
     assert touching.argmax() > 0
@@ -190,10 +190,8 @@ def test_contact_with_a_tip_a_shaft_and_a_corner() -> None:
 
     # Swept past the corner of an object: the bend grows, then the whisker is free at once.
     sides = polygon_edges(square(np.array([0.12, 0.1]), 0.2, np.pi / 4))
-    sweep = np.linspace(-0.7, 0.7, 400)
-    bend = bend_shafts(
-        FAN.shaft, np.zeros((400, 1, 2)), sweep[:, None], sides + [0.09, -0.1] * 2, np.zeros(1, int)
-    )
+    sweep = np.column_stack([np.zeros((400, 2)), np.linspace(-0.7, 0.7, 400)])
+    bend = bend_whiskers(ONE, sweep, sides + [0.09, -0.1] * 2, np.zeros(1, int))
     turn, reach = bend.turn[:, 0], bend.reach[:, 0]
     held = turn != 0
     assert held.any()
@@ -245,9 +243,9 @@ def test_horizontal_strain_has_the_side_and_vertical_strain_the_slant() -> None:
 
     def strains(angle: float) -> np.ndarray:
         """Strain [2] of a whisker at this angle to the wall, with its tip bent aside by 0.1 rad."""
-        base = np.array([[[0.0, LENGTH * np.sin(angle - 0.1)]]])
-        one = bend_shafts(FAN.shaft, base, np.array([[-angle]]), wall, np.zeros(1, int))
-        return base_strains(CONFIG, FAN._replace(alive=np.ones(1, bool)), one)[0, 0]
+        pose = np.array([[0.0, LENGTH * np.sin(angle - 0.1), -angle]])
+        one = bend_whiskers(ONE, pose, wall, np.zeros(1, int))
+        return base_strains(CONFIG, ONE._replace(alive=np.ones(1, bool)), one)[0, 0]
 
     steep, slanting = strains(1.2), strains(0.5)
     assert steep[0] == pytest.approx(slanting[0])
@@ -269,8 +267,12 @@ def test_dead_whiskers_have_no_strain() -> None:
 
 
 def test_body_vibration_has_its_frequency_and_decays() -> None:
-    config = ShakeConfig()
-    shakes = np.array([body_vibration(config, 4000, 2000.0, stream(seed, "strain")) for seed in range(60)])
+    still, config = CONFIG.model_copy(update={"noise": 0.0}), CONFIG.shake
+
+    def shake(rows: int, seed: int) -> np.ndarray:
+        return sample_strain(still, np.zeros((rows, 4, 2)), FAN.alive, stream(seed, "strain"))[:, 0]
+
+    shakes = np.array([shake(4000, seed) for seed in range(60)])
     power = (np.abs(np.fft.rfft(shakes, axis=1)) ** 2).mean(axis=(0, 2))
     frequency = np.fft.rfftfreq(4000, 1 / 2000.0)
     assert abs(frequency[power.argmax()] - config.frequency) < 2
@@ -278,7 +280,7 @@ def test_body_vibration_has_its_frequency_and_decays() -> None:
     late = shakes[:, 2000:].std()
     assert late == pytest.approx(config.rumble, rel=0.1)
     assert shakes[:, :100].std() > 2 * late
-    assert body_vibration(config, 0, 2000.0, stream(0, "strain")).shape == (0, 2)
+    assert shake(0, 0).shape == (0, 2)
 
 
 def test_sensor_noise_has_the_configured_level() -> None:
