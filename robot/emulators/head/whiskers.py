@@ -24,16 +24,16 @@ from robot.drivers.ur10.rtde_protocol import PoseListener
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
 from robot.simulation.head.baseline import make_baseline
 from robot.simulation.head.whisk_stream import (
-    WallSweep,
     WhiskerBalance,
     advance_balance,
     draw_noise,
     sensor_readings,
+    sweep_air,
     sweep_walls,
     whiskers_at_rest,
 )
 from robot.world.scene import HeadPath, poses_at
-from robot.world.walls import NO_CONTACT, Surroundings, Walls
+from robot.world.walls import Surroundings, Walls
 from tactile.base.random_streams import stream
 from tactile.whisker_geometry import Head, ur10_head
 from tactile.whisking import WhiskDrive, WhiskingConfig, whisk_command, whisk_phase
@@ -181,8 +181,7 @@ class Whiskers(SensorArray):
                     self._around, self._lowered = Surroundings(lower, self.head), lift
                 sweep = sweep_walls(self._around, pose, knots, time, some)
             else:
-                nothing = np.zeros((len(time), 1, self.count))
-                sweep = WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, some)
+                sweep = sweep_air(time, some)
             truth, self.balance = advance_balance(
                 self.config, self.mechanics, self.drives.law, sweep, self.balance
             )

@@ -36,16 +36,6 @@ BISECTIONS = 24
 """Bisection steps in the search of the contact position, accurate to 10 nm."""
 
 
-class Shaft(NamedTuple):
-    """Attributes:
-    length: m. radius: at its base, m. taper: k, 1/m.
-    """
-
-    length: float
-    radius: float
-    taper: float
-
-
 class Bending(NamedTuple):
     """Bending of whiskers [T, W]; zero where free, with the length as reach.
 
@@ -61,14 +51,14 @@ class Bending(NamedTuple):
     side: np.ndarray
 
 
-def base_strain(shaft: Shaft, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
+def base_strain(fan: FixedWhiskers, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Surface strain at the base, M r0 / (E I), with the sign of the rotation."""
-    return 3 * shaft.radius * (1 / reach - shaft.taper) * turn
+    return 3 * fan.radius * (1 / reach - fan.taper) * turn
 
 
-def shaft_tilt(shaft: Shaft, reach: np.ndarray) -> np.ndarray:
+def shaft_tilt(fan: FixedWhiskers, reach: np.ndarray) -> np.ndarray:
     """Ratio of the shaft's tilt at the contact to the rotation of the line from base to contact."""
-    narrow = shaft.taper * reach
+    narrow = fan.taper * reach
     return (3 - 2 * narrow) / (2 * (1 - narrow))
 
 
@@ -84,7 +74,7 @@ class _Ends(NamedTuple):
 
 
 def _blocked_ends(
-    shaft: Shaft, base: np.ndarray, direction: np.ndarray, segments: np.ndarray
+    fan: FixedWhiskers, base: np.ndarray, direction: np.ndarray, segments: np.ndarray
 ) -> tuple[_Ends, _Ends]:
     """Lower and upper ends [T, W, S] of the angles, relative to the straight shaft, that walls block. For a
     wall out of reach the lower end is above the upper one."""
@@ -94,7 +84,7 @@ def _blocked_ends(
     x, y, u, v = c * x + s * y, c * y - s * x, c * u + s * v, c * v - s * u
     # The part of each wall within reach of the base.
     square, middle = u * u + v * v, -(x * u + y * v)
-    inner = middle**2 - square * (x * x + y * y - shaft.length**2)
+    inner = middle**2 - square * (x * x + y * y - fan.length**2)
     half = np.sqrt(np.maximum(inner, 0.0))
     first, last = np.maximum((middle - half) / square, 0.0), np.minimum((middle + half) / square, 1.0)
     there = (inner > 0) & (first < last)
@@ -125,25 +115,25 @@ def _free_ends(low: _Ends, high: _Ends) -> _Ends:
     return _Ends(angle, radius, near, away)
 
 
-def _solve_contacts(shaft: Shaft, end: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _solve_contacts(fan: FixedWhiskers, end: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rotation, reach and lean [K] of whiskers in contact at that end."""
     turn, reach = end.angle.copy(), end.radius.copy()
-    tip = end.radius >= shaft.length * (1 - 1e-9)
+    tip = end.radius >= fan.length * (1 - 1e-9)
     away = np.minimum(end.away, reach * (1 - 1e-12))
     slant = np.arcsin(away / reach)  # angle between the line to the contact and the wall
-    lean = np.where(tip, slant, (shaft_tilt(shaft, reach) - 1) * turn)
-    flat = np.flatnonzero(tip & ((shaft_tilt(shaft, reach) - 1) * turn > slant))
+    lean = np.where(tip, slant, (shaft_tilt(fan, reach) - 1) * turn)
+    flat = np.flatnonzero(tip & ((shaft_tilt(fan, reach) - 1) * turn > slant))
     if len(flat):
         wall = turn[flat] + slant[flat]  # angle between the straight shaft and the wall
-        near, far = end.near[flat], np.full(len(flat), shaft.length)
+        near, far = end.near[flat], np.full(len(flat), fan.length)
         for _ in range(BISECTIONS):
             middle = (near + far) / 2
             slope = np.arcsin(np.minimum(away[flat] / middle, 1.0))
-            beyond = (shaft_tilt(shaft, middle) - 1) * (wall - slope) > slope
+            beyond = (shaft_tilt(fan, middle) - 1) * (wall - slope) > slope
             near, far = np.where(beyond, near, middle), np.where(beyond, middle, far)
         reach[flat] = far
         turn[flat] = wall - np.arcsin(np.minimum(away[flat] / far, 1.0))
-        lean[flat] = (shaft_tilt(shaft, far) - 1) * turn[flat]
+        lean[flat] = (shaft_tilt(fan, far) - 1) * turn[flat]
     return turn, reach, lean
 
 
@@ -220,24 +210,27 @@ class FixedWhiskers(NamedTuple):
     """Whiskers fixed to the body.
 
     Attributes:
-        base: [W, 2] m and direction: [W] rad in base_link. shaft: of all whiskers. alive: [W] bool.
+        base: [W, 2] m and direction: [W] rad in base_link. length: m, radius: at the base, m, and taper: k,
+            1/m, of all whiskers. alive: [W] bool.
     """
 
     base: np.ndarray
     direction: np.ndarray
-    shaft: Shaft
+    length: float
+    radius: float
+    taper: float
     alive: np.ndarray
 
     @property
     def reach(self) -> float:
         """Largest distance of a contact from the centre of the body, m."""
-        return float(np.hypot(self.base[:, 0], self.base[:, 1]).max()) + self.shaft.length
+        return float(np.hypot(self.base[:, 0], self.base[:, 1]).max()) + self.length
 
     @property
     def tip(self) -> np.ndarray:
         """Tips [W, 2] of straight whiskers in base_link, m."""
         way = np.stack([np.cos(self.direction), np.sin(self.direction)], axis=1)
-        return self.base + self.shaft.length * way
+        return self.base + self.length * way
 
 
 def fixed_whiskers(config: WhiskersConfig) -> FixedWhiskers:
@@ -247,7 +240,7 @@ def fixed_whiskers(config: WhiskersConfig) -> FixedWhiskers:
     taper = (1 - config.tip_diameter / config.base_diameter) / config.length
     alive = np.ones(len(base), bool)
     alive[list(config.dead)] = False
-    return FixedWhiskers(base, direction, Shaft(config.length, config.base_diameter / 2, taper), alive)
+    return FixedWhiskers(base, direction, config.length, config.base_diameter / 2, taper, alive)
 
 
 def bend_whiskers(fan: FixedWhiskers, pose: np.ndarray, segments: np.ndarray, side: np.ndarray) -> Bending:
@@ -262,10 +255,10 @@ def bend_whiskers(fan: FixedWhiskers, pose: np.ndarray, segments: np.ndarray, si
     base = np.stack([pose[:, :1] + c * x - s * y, pose[:, 1:2] + s * x + c * y], axis=-1)
     direction = pose[:, 2:] + fan.direction
     free, no_side = np.zeros(direction.shape), np.zeros(direction.shape, int)
-    nothing = Bending(free, free + fan.shaft.length, free, no_side)
+    nothing = Bending(free, free + fan.length, free, no_side)
     if not len(segments):
         return nothing
-    low, high = _blocked_ends(fan.shaft, base, direction, segments)
+    low, high = _blocked_ends(fan, base, direction, segments)
     blocked = np.any((low.angle < 0) & (high.angle > 0), axis=-1)
     if not blocked.any():
         return nothing
@@ -284,15 +277,15 @@ def bend_whiskers(fan: FixedWhiskers, pose: np.ndarray, segments: np.ndarray, si
     way = sides[row, whisker]
     chosen = _Ends(*(np.where(way > 0, a, b) for a, b in zip(left, right, strict=True)))
     turn, reach, lean = (free.copy() for _ in range(3))
-    reach += fan.shaft.length
-    angle, reach[row, whisker], lean[row, whisker] = _solve_contacts(fan.shaft, chosen)
+    reach += fan.length
+    angle, reach[row, whisker], lean[row, whisker] = _solve_contacts(fan, chosen)
     turn[row, whisker] = way * angle
     return Bending(turn, reach, lean, sides)
 
 
 def base_strains(config: WhiskersConfig, fan: FixedWhiskers, bent: Bending) -> np.ndarray:
     """Horizontal and vertical strain [T, W, 2] of bent whiskers, without noise."""
-    across = base_strain(fan.shaft, bent.turn, bent.reach)
+    across = base_strain(fan, bent.turn, bent.reach)
     # The force along the shaft bends it by the lever of its droop, the force across it by its length.
     along = np.tan(np.minimum(bent.lean + np.arctan(config.friction), MAX_LEAN))
     down = np.tan(np.radians(config.droop_deg)) * np.abs(across) * along

@@ -124,8 +124,9 @@ def _systems(setup: HeadSetup, model: Beam) -> tuple[np.ndarray, np.ndarray]:
     servo = mechanics.servo * model.unit
     lengths, which = np.unique(head.length, return_inverse=True)
     steps, pushes = [], []
-    for length in lengths:
-        unit = config.beam.time_unit(float(length))
+    beam = config.beam
+    for length in lengths.tolist():
+        unit = float(length**2 * 2 / beam.radius * np.sqrt(beam.density / beam.modulus))  # of time, s
         sample = 1 / (config.rate * unit)
         rotor = servo / (2 * np.pi * config.servo.frequency * unit) ** 2
         mass = np.zeros((3, 3))
@@ -136,7 +137,7 @@ def _systems(setup: HeadSetup, model: Beam) -> tuple[np.ndarray, np.ndarray]:
         spring, damper = np.zeros((3, 3)), np.zeros((3, 3))
         spring[0, 0], damper[0, 0] = servo, drag
         spring[1:, 1:] = model.stiffness
-        damper[1:, 1:] = 2 * config.beam.damping / model.modes[0] * model.stiffness
+        damper[1:, 1:] = 2 * beam.damping / model.modes[0] * model.stiffness
         inverse = np.linalg.inv(mass)
         flow = np.zeros((11, 11))  # six states, command, its rate, three forces
         flow[:3, 3:6] = sample * np.eye(3)

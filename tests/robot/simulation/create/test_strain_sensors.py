@@ -10,7 +10,6 @@ from pydantic import ValidationError
 
 from robot.simulation.create.strain_sensors import (
     Bending,
-    Shaft,
     ShakeConfig,
     WhiskersConfig,
     base_strain,
@@ -28,7 +27,7 @@ from tactile.contact_threshold import ShaftConfig, stiffness
 SEEDS = st.integers(0, 10**6)
 CONFIG = WhiskersConfig()
 FAN = fixed_whiskers(CONFIG)
-LENGTH = FAN.shaft.length
+LENGTH = FAN.length
 FREE = np.zeros(4, int)
 
 
@@ -103,7 +102,7 @@ def test_a_whisker_turns_by_the_smallest_free_angle(seed: int) -> None:
 
 def flat(bend: Bending) -> np.ndarray:
     """Whiskers whose shaft lies along a wall or a corner."""
-    return np.isclose((shaft_tilt(FAN.shaft, bend.reach) - 1) * np.abs(bend.turn), bend.lean, atol=1e-6)
+    return np.isclose((shaft_tilt(FAN, bend.reach) - 1) * np.abs(bend.turn), bend.lean, atol=1e-6)
 
 
 @settings(max_examples=15)
@@ -186,7 +185,7 @@ def test_contact_with_a_tip_a_shaft_and_a_corner() -> None:
     assert (np.diff(reach[lies]) < 0).all()
     assert np.abs(np.diff(reach)).max() < 3e-3  # without jumps
     # A whisker along the wall has the wall's direction.
-    assert np.allclose(turn[lies] * shaft_tilt(FAN.shaft, reach[lies]), np.pi / 4)
+    assert np.allclose(turn[lies] * shaft_tilt(FAN, reach[lies]), np.pi / 4)
 
     # Swept past the corner of an object: the bend grows, then the whisker is free at once.
     sides = polygon_edges(square(np.array([0.12, 0.1]), 0.2, np.pi / 4))
@@ -216,7 +215,7 @@ def test_a_wall_out_of_reach_bends_no_whisker() -> None:
 @given(st.floats(0.02, 0.139), st.floats(0.2, 1.0))
 def test_moments_are_those_of_a_tapered_beam(reach: float, taper: float) -> None:
     """Compared with the integrated curvature of a cone under a point force."""
-    shaft = Shaft(0.14, 0.7e-3, (1 - taper) / 0.14)
+    shaft = FAN._replace(radius=0.7e-3, taper=(1 - taper) / LENGTH)
     x = np.linspace(0, reach, 4001)
     curvature = (reach - x) / (1 - shaft.taper * x) ** 4  # F / (E I0) = 1
 
@@ -234,7 +233,7 @@ def test_moments_are_those_of_a_tapered_beam(reach: float, taper: float) -> None
 @given(st.floats(0.1, 1.0))
 def test_wall_estimation_uses_the_same_beam_model(share: float) -> None:
     config = ShaftConfig(taper=0.3 / 1.45)
-    mine = base_strain(FAN.shaft, np.array([1.0, 1.0]), LENGTH * np.array([share, config.reference]))
+    mine = base_strain(FAN, np.array([1.0, 1.0]), LENGTH * np.array([share, config.reference]))
     assert mine[0] / mine[1] == pytest.approx(float(stiffness(config, share)))
 
 
