@@ -282,7 +282,7 @@ class Arm:
             self._stop_by = time.monotonic() + DASHBOARD_DELAY
 
     def fail(self, outcome: SessionOutcome, detail: str) -> None:
-        """Stops the arm with a fault, unless it has one. After a contact the tool backs off along its path."""
+        """Stops the arm with a fault, if it has none. After a contact the tool backs off along its path."""
         with self.lock:
             if self.fault is not None:
                 return
