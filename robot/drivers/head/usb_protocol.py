@@ -144,7 +144,7 @@ class Command(NamedTuple):
         if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(drive).all():
             return None
         numbers = np.frombuffer(packet, "<i2", count, _COMMAND.size).astype(np.int16)
-        return cls(CommandKind(kind), FeedbackMode(mode), *drive, numbers=numbers)
+        return cls._make([CommandKind(kind), FeedbackMode(mode), *drive, numbers])
 
 
 _COMMAND = struct.Struct("<4sBBBB5f")
