@@ -347,7 +347,5 @@ def check_states(config: ArmConfig, states: Callable[[], np.ndarray]) -> None:
         time.sleep(0.05)
     here = states()[-1]["tcp"]
     if not config.box.contains(here):
-        place = ", ".join(f"{v:.3f}" for v in here[:3])
-        raise StartupRefused(
-            f"the tool stands at ({place}) m, outside the box", "", "move it into the box by hand"
-        )
+        found = f"the tool stands at {_place(here)}, outside the box"
+        raise StartupRefused(found, "", "move it into the box by hand")

@@ -320,13 +320,10 @@ class CreateWhiskers(SensorArray):
         self._fan = fixed_whiskers(config.whiskers)
         self._samples = block_samples(config.whiskers.rate)
         self._shaking = BodyVibration(config.whiskers.shake, config.whiskers.rate, random)
+        self.count = len(self._fan.base)
         self._side = np.zeros(self.count, int)
         self._pose = robot.pose
         self._changes = 0
-
-    @property
-    def count(self) -> int:
-        return len(self._fan.base)
 
     def block(self, start: float, end: float) -> Block:
         self._move(end)

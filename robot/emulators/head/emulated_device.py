@@ -340,14 +340,9 @@ class Fifo:
         """Number of frames in the queue."""
         return len(self._frames) + bool(self._begun)
 
-    @property
-    def room(self) -> int:
-        """Number of frames that still fit."""
-        return self.capacity - len(self)
-
     def push(self, frames: Sequence[bytes]) -> None:
         """Adds the first frames that fit."""
-        fits = frames[: self.room]
+        fits = frames[: self.capacity - len(self)]
         self._frames.extend(fits)
         self.made += len(frames)
         self.lost += len(frames) - len(fits)

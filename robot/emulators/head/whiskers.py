@@ -64,10 +64,8 @@ class Block(NamedTuple):
 class SensorArray:
     """Simulated whiskers; fixed ones have no drives. Times are the host's monotonic clock, s."""
 
-    @property
-    def count(self) -> int:
-        """Number of whiskers."""
-        raise NotImplementedError
+    count: int
+    """Number of whiskers."""
 
     @property
     def resting(self) -> bool:
@@ -110,7 +108,7 @@ class Whiskers(SensorArray):
         rate, mechanics, head = config.stream.rate, config.mechanics, ur10_head(config.head)
         self.config, self.mechanics, self.head = config.stream, mechanics, head
         self.walls, self.place, self.random = walls, place, stream(config.seed, "sensor")
-        self.samples = block_samples(rate)
+        self.count, self.samples = len(head.length), block_samples(rate)
         self.baseline = make_baseline(mechanics.baseline, mechanics.noise, rate, self.count, config.seed)
         self.drives = _ServoDrives(head, rate)
         self.balance = whiskers_at_rest(1, self.count)
@@ -120,10 +118,6 @@ class Whiskers(SensorArray):
         self._lowered = np.inf
         # Above this lift no tip reaches the tallest wall.
         self._clear = float(walls.height.max() + (head.length - head.base[:, 2]).max())
-
-    @property
-    def count(self) -> int:
-        return len(self.head.length)
 
     @property
     def resting(self) -> bool:

@@ -100,6 +100,7 @@ class CreateSimulation(SimulatedSource):
         self.steps = steps = list(_drive_steps(config, robot, start))
         duration = np.array([step.duration for step in steps])
         self.time = np.cumsum(duration)
+        self.rate_hz = rate_of(self.time)
         pose = np.array([start.pose, *(step.pose for step in steps)])
         self.truth = wrap_headings(pose[1:])
         motion = np.column_stack([between(pose[:-1], pose[1:])[:, :2], np.diff(pose[:, 2]), duration])
@@ -108,10 +109,6 @@ class CreateSimulation(SimulatedSource):
         self.info = describe_create(config, self.arena)
         document = {"create_simulation": self.info.provenance["create_simulation"], "arena": self.info.arena}
         self.digest = digest_of_document(document)
-
-    @property
-    def rate_hz(self) -> float:
-        return rate_of(self.time)
 
     def _readings(self) -> Iterator[Report]:
         return (make_report(self.config, step, NO_ODOMETRY) for step in self.steps)

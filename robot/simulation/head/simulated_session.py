@@ -238,7 +238,10 @@ class HeadSimulation(SimulatedSource):
         self.config, self.head_config = config, head_config
         self.tier, self.tier_reason = choose_tier(config)
         self.head = head = ur10_head(head_config)
+        self.whiskers, self.view_shape = len(head.length), (*head.shape, 1)
         whisking, seed = config.whisking, config.seed
+        self.rate_hz = whisking.rate
+        self._setup = HeadSetup(head, config.stream, config.mechanics, whisking)
         check_amplitude(whisking, head)
         self.scene = make_scene(config.maze, config.path, config.motion, config.kidnaps, head, seed)
         check_steps("simulation", min(self.scene.duration, self.scene.path.duration) * whisking.rate)
@@ -293,22 +296,6 @@ class HeadSimulation(SimulatedSource):
             ),
             provenance={"simulation": plain},
         )
-
-    @property
-    def _setup(self) -> HeadSetup:
-        return HeadSetup(self.head, self.config.stream, self.config.mechanics, self.config.whisking)
-
-    @property
-    def rate_hz(self) -> float:
-        return self.config.whisking.rate
-
-    @property
-    def view_shape(self) -> tuple[int, int, int]:
-        return (*self.head.shape, 1)
-
-    @property
-    def whiskers(self) -> int:
-        return len(self.head.length)
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
         if self.features is None:

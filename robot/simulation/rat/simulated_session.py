@@ -259,7 +259,7 @@ class RatSimulation(SimulatedSource):
     whiskers = 0
 
     def __init__(self, config: RatSimulationConfig, path: RatPath | None = None) -> None:
-        self.config = config
+        self.config, self.rate_hz = config, config.rate_hz
         self.view_shape = (1, config.views.columns, 1)
         pose = _poses_of(config, path)
         rows = len(pose)
@@ -285,10 +285,6 @@ class RatSimulation(SimulatedSource):
         self.info = _describe(config, self._boxes)
         document = digest_of_document(self.info.provenance)
         self.digest = digest_of([document.encode(), np.ascontiguousarray(pose).tobytes()])
-
-    @property
-    def rate_hz(self) -> float:
-        return self.config.rate_hz
 
     def views(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows [V] with a view, and these views [V, 1, C, 1]. Darkness has none."""
