@@ -93,11 +93,20 @@ class CreateSimulation(SimulatedSource):
     def __init__(self, config: CreateSimulationConfig) -> None:
         self.config = config
         self.arena = make_arena(config.arena, config.seed)
-        walls, random = wall_segments(self.arena), stream(config.seed, "strain")
-        robot = CreateRobot(config.behaviour, config.whiskers, walls, random)
+        walls, noise = wall_segments(self.arena), stream(config.seed, "strain")
+        robot = CreateRobot(config.behaviour, config.whiskers, walls, noise)
         self.whiskers = len(robot.whiskers.base)
-        start = robot.at(self.arena.start)
-        self.steps = steps = list(_drive_steps(config, robot, start))
+        start, random = robot.at(self.arena.start), stream(config.seed, "behaviour")
+        self.steps: list[CreateStep] = []
+        step, doing, time = start, MachineState(CreateState.FWD1), 0.0
+        while (len(self.steps) < config.reports) if config.reports else (time < 60 * config.minutes):
+            before, command = step, wheel_command(config.behaviour, doing)
+            step = robot.step(before, doing.state, command)
+            self.steps.append(step)
+            time += step.duration
+            turned = float(step.pose[2] - before.pose[2])
+            doing = next_state(config.behaviour, doing, step.moment, turned, random)
+        steps = self.steps
         duration = np.array([step.duration for step in steps])
         self.time = np.cumsum(duration)
         self.rate_hz = rate_of(self.time)
@@ -123,20 +132,6 @@ def describe_create(config: CreateSimulationConfig, arena: Arena) -> SourceInfo:
         arena=arena_text(arena),
         provenance={"create_simulation": config.model_dump(mode="json", exclude={"arena": {"file"}})},
     )
-
-
-def _drive_steps(
-    config: CreateSimulationConfig, robot: CreateRobot, start: CreateStep
-) -> Iterator[CreateStep]:
-    random = stream(config.seed, "behaviour")
-    step, doing, time, count = start, MachineState(CreateState.FWD1), 0.0, 0
-    while (count < config.reports) if config.reports else (time < 60 * config.minutes):
-        before = step
-        step = robot.step(before, doing.state, wheel_command(config.behaviour, doing))
-        time, count = time + step.duration, count + 1
-        turned = float(step.pose[2] - before.pose[2])
-        doing = next_state(config.behaviour, doing, step.moment, turned, random)
-        yield step
 
 
 HALF_WALL = 10.0
@@ -197,15 +192,9 @@ def make_report(config: CreateSimulationConfig, step: CreateStep, odometry: Odom
     )
 
 
-def train_strain_templates(
-    config: CreateSimulationConfig, training: TemplateTraining | None = None
-) -> StrainTemplates:
-    """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G).
-
-    Raises:
-        InputError: the training has another sample rate than the whiskers.
-    """
-    training = training or TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
+def train_strain_templates(config: CreateSimulationConfig) -> StrainTemplates:
+    """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G)."""
+    training = TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
     random = stream(config.seed, "templates")
     return train_templates(
         (
@@ -283,22 +272,12 @@ class CreateRobot:
         assert end is not None
         row, moment = end
         duration = float(time[row])
-        return CreateStep(
-            state,
-            moment,
-            duration,
-            poses[row],
-            bent.side[row],
-            np.abs(known[row, :, 0]) > config.contact,
-            self._sampled_strain(last, near, command, duration if state == CreateState.FWD2 else 0.0),
-        )
-
-    def _sampled_strain(
-        self, last: CreateStep, near: np.ndarray, command: WheelCommand, duration: float
-    ) -> np.ndarray:
-        time = np.arange(round(duration * self.sensors.rate)) / self.sensors.rate
-        if not len(time):
-            return np.zeros((0, len(self.whiskers.base), 2))
-        bent = bend_whiskers(self.whiskers, drive(command, last.pose, time), near, last.side)
-        strain = base_strains(self.sensors, self.whiskers, bent)
-        return sample_strain(self.sensors, strain, self.whiskers.alive, self._random)
+        contact = np.abs(known[row, :, 0]) > config.contact
+        samples = round(duration * self.sensors.rate) if state == CreateState.FWD2 else 0
+        sampled = np.zeros((0, len(contact), 2))
+        if samples:
+            poses_sampled = drive(command, last.pose, np.arange(samples) / self.sensors.rate)
+            bent_then = bend_whiskers(self.whiskers, poses_sampled, near, last.side)
+            strain = base_strains(self.sensors, self.whiskers, bent_then)
+            sampled = sample_strain(self.sensors, strain, self.whiskers.alive, self._random)
+        return CreateStep(state, moment, duration, poses[row], bent.side[row], contact, sampled)

@@ -298,12 +298,9 @@ class HeadSimulation(SimulatedSource):
         )
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
-        if self.features is None:
-            return self._cycles()
-        return (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in zip(*self.features, strict=True))
-
-    def _cycles(self) -> Iterator[Cycle]:
-        """Raw samples of each cycle, without odometry."""
+        if self.features is not None:
+            yield from (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in zip(*self.features, strict=True))
+            return
         assert self.calibration is not None
         random, baseline = stream(self.config.seed, "sensor"), deepcopy(self._baseline)
         model, threshold = RAW_TIERS[self.tier], self.calibration.threshold[:, 1]

@@ -178,7 +178,14 @@ def sweep_walls(
     share = ((time - knots[place]) / step)[:, None, None]
     same = (box[:-1] == box[1:]) & (box[1:] >= 0)
     share = np.where(same[place], share, np.round(share))
-    drift = _drift(surroundings, pose, step, wall, reach)
+    # Sideways angular speed [K, N, W] of the walls.
+    motion = between(pose[:, :-1].reshape(-1, 3), pose[:, 1:].reshape(-1, 3)).reshape(*pose[:, 1:].shape)
+    speed, outwards = motion.swapaxes(0, 1)[:, :, None] / step, surroundings.outwards
+    opening = surroundings.opening - np.where(wall < NO_CONTACT, wall, 0.0)
+    arm = np.maximum(reach, 0.05) * head.length
+    out = surroundings.radius + arm * np.sin(opening)
+    sideways = speed[..., 1] * outwards[:, 0] - speed[..., 0] * outwards[:, 1] + speed[..., 2] * out[:-1]
+    drift = -sideways / arm[:-1]
     with np.errstate(invalid="ignore"):
         mixed = wall[place] + share * (wall[place + 1] - wall[place])
     return WallSweep(
@@ -188,20 +195,6 @@ def sweep_walls(
         drift=drift[place],
         noise=noise,
     )
-
-
-def _drift(
-    surroundings: Surroundings, pose: np.ndarray, step: float, wall: np.ndarray, reach: np.ndarray
-) -> np.ndarray:
-    """Sideways angular speed [K, N, W] of walls between successive poses, rad/s."""
-    outwards = surroundings.outwards
-    motion = between(pose[:, :-1].reshape(-1, 3), pose[:, 1:].reshape(-1, 3)).reshape(*pose[:, 1:].shape)
-    speed = motion.swapaxes(0, 1)[:, :, None] / step
-    opening = surroundings.opening - np.where(wall < NO_CONTACT, wall, 0.0)
-    arm = np.maximum(reach, 0.05) * surroundings.head.length
-    out = surroundings.radius + arm * np.sin(opening)
-    sideways = speed[..., 1] * outwards[:, 0] - speed[..., 0] * outwards[:, 1] + speed[..., 2] * out[:-1]
-    return -sideways / arm[:-1]
 
 
 WhiskingLaw = Callable[[WhiskDrive, float, np.ndarray], tuple[np.ndarray, WhiskDrive]]
