@@ -34,6 +34,7 @@ from robot.drivers.head.usb_protocol import (
 )
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig
 from robot.emulators.head.whiskers import Block, SensorArray, block_samples
+from robot.emulators.listening import do_fault
 from tactile.base.random_streams import stream
 
 STRINGS = ("", "ratslam", "emulated whisker head", "EMULATED")
@@ -139,23 +140,13 @@ class EmulatedHead:
         return answer[:size]
 
     def do(self, request: dict[str, Any], now: float) -> dict[str, Any]:
-        """Starts a fault, or returns counts or state: {"do": name, ...}.
-
-        Raises:
-            ValueError, TypeError: unknown fault or invalid arguments.
-        """
-        arguments = dict(request)
-        name = str(arguments.pop("do", ""))
-        if name == "counts":
-            return self.counts()
-        if name == "state":
-            return self.state(now)
-        if name not in self.faults.known:
-            raise ValueError(f"{name!r}; known are {', '.join(self.faults.known)}, counts, state")
-        self.faults.known[name](now, **arguments)
-        if name == "unplug":
+        """Starts a fault, or returns counts or state (`robot.emulators.listening.do_fault`)."""
+        self.faults.now = now
+        known = self.faults.known | {"counts": self.counts, "state": lambda: self.state(now)}
+        answer = do_fault(known, request)
+        if request.get("do") == "unplug":
             self.halt()
-        return {"ok": True}
+        return answer
 
     def halt(self) -> None:
         """Retracts the whiskers, stops making frames and drops unread ones."""
@@ -248,20 +239,21 @@ class _HeadFaults:
         self._pending: Counter[str] = Counter()  # bytes of garbage; frames to corrupt, skip and swap
         self._saturated: dict[int, float] = {}
         self._halted, self._halted_until, self._silent_until = False, -np.inf, -np.inf
-        self.known: dict[str, Callable[..., None]] = {
-            "unplug": lambda now: setattr(self, "plugged", False),
+        self.now = 0.0  # of a request
+        self.known: dict[str, Callable[..., Any]] = {
+            "unplug": lambda: setattr(self, "plugged", False),
             "plug": self._plug,
             "stall": self._stall,
-            "silence": lambda now, seconds=1.0: setattr(self, "_silent_until", now + float(seconds)),
-            "garbage": lambda now, bytes=64: self._pending.update(garbage=int(bytes)),
-            "corrupt": lambda now, frames=1: self._pending.update(corrupt=int(frames)),
-            "skip": lambda now, frames=1: self._pending.update(skip=int(frames)),
-            "swap": lambda now, frames=1: self._pending.update(swap=int(frames)),
-            "clock": lambda now, jump_us: setattr(self, "jump", self.jump + int(jump_us)),
+            "silence": lambda seconds=1.0: setattr(self, "_silent_until", self.now + float(seconds)),
+            "garbage": lambda bytes=64: self._pending.update(garbage=int(bytes)),
+            "corrupt": lambda frames=1: self._pending.update(corrupt=int(frames)),
+            "skip": lambda frames=1: self._pending.update(skip=int(frames)),
+            "swap": lambda frames=1: self._pending.update(swap=int(frames)),
+            "clock": lambda jump_us: setattr(self, "jump", self.jump + int(jump_us)),
             "saturate": self._saturate,
-            "die": lambda now: os._exit(1),
+            "die": lambda: os._exit(1),
         }
-        """Faults by name; each takes the time and its arguments."""
+        """Faults by name; each takes its arguments."""
 
     def check_in(self, now: float) -> bool:
         """Whether the frame endpoint returns data.
@@ -307,17 +299,17 @@ class _HeadFaults:
             self._pending["swap"] -= 1
         return frames
 
-    def _plug(self, now: float) -> None:
+    def _plug(self) -> None:
         self.plugs += not self.plugged
         self.plugged, self._halted, self._halted_until = True, False, -np.inf
 
-    def _stall(self, now: float, seconds: float = 0.0) -> None:
-        self._halted, self._halted_until = True, now + float(seconds)
+    def _stall(self, seconds: float = 0.0) -> None:
+        self._halted, self._halted_until = True, self.now + float(seconds)
 
-    def _saturate(self, now: float, whisker: int = 0, seconds: float = 1.0) -> None:
+    def _saturate(self, whisker: int = 0, seconds: float = 1.0) -> None:
         if not 0 <= whisker < self._whiskers:
             raise ValueError(f"whisker {whisker}; the head has 0 to {self._whiskers - 1}")
-        self._saturated[whisker] = now + float(seconds)
+        self._saturated[whisker] = self.now + float(seconds)
 
 
 class Fifo:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import json
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
@@ -21,7 +20,7 @@ from robot.drivers.ur10.rtde_protocol import PoseListener
 from robot.emulators.head.emulated_device import DESCRIPTORS, EmulatedHead
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.head.whiskers import AlongPath, CarriedByArm, PoseSource, Whiskers
-from robot.emulators.listening import listening
+from robot.emulators.listening import answer_fault, listening
 from robot.world.scene import HeadPath, KidnapConfig, make_scene
 from tactile.whisker_geometry import ur10_head
 
@@ -130,12 +129,8 @@ class _HeadServer:
     async def faults(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Executes fault requests: one JSON line each, answered by one JSON line."""
         while line := await reader.readline():
-            try:
-                answer = self._do(dict(json.loads(line)), time.monotonic())
-            except (TypeError, ValueError) as error:
-                answer = {"ok": False, "error": str(error)}
+            writer.write(answer_fault(line, lambda request: self._do(request, time.monotonic())))
             self._notify()
-            writer.write(json.dumps(answer).encode() + b"\n")
             await writer.drain()
 
     async def _answer(self, header: tuple[int, ...], data: bytes, plugs: int, connection: object) -> bytes:

@@ -8,7 +8,6 @@ Robots, "Real-Time Data Exchange (RTDE) Guide" and "Dashboard Server", CB3 and e
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import selectors
@@ -21,7 +20,7 @@ from typing import Any
 from robot.drivers.processes import urgent
 from robot.drivers.ur10 import rtde_protocol
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
-from robot.emulators.listening import listening
+from robot.emulators.listening import answer_fault, do_fault, listening
 from robot.emulators.ur10.controller import EmulatedController, RobotMode, Runtime, Value
 from robot.emulators.ur10.emulated_arm import Unreachable
 from robot.emulators.ur10.emulator_config import (
@@ -428,47 +427,37 @@ class _ControllerFaults:
 
     def answer(self, line: bytes) -> bytes:
         """Executes a request; returns a JSON line, nothing for an empty one."""
-        if not line.strip():
-            return b""
-        try:
-            answer = self._do(json.loads(line))
-        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            answer = {"ok": False, "error": f"{type(error).__name__}: {error}"}
-        return json.dumps(answer).encode() + b"\n"
+        return answer_fault(line, lambda request: do_fault(self.known, request)) if line.strip() else b""
 
-    def _do(self, request: dict[str, Any]) -> dict[str, Any]:
-        what = request["do"]
+    @property
+    def known(self) -> dict[str, Callable[..., object]]:
+        """The functions of the faults, by name; each takes its arguments."""
         controller, active = self._controller, self._active
         arm, header, fields = controller.arm, rtde_protocol.HEADER, controller.registers.fields
-        known: dict[str, Callable[[], object]] = {
-            "stall": lambda: active.update(stall=time.monotonic() + float(request["seconds"])),
+        return {
+            "stall": lambda seconds: active.update(stall=time.monotonic() + float(seconds)),
             "malformed": lambda: self._send(lambda _: header.pack(0, rtde_protocol.DATA)),
             "truncated": lambda: self._send(lambda state: state[: len(state) // 2]),
             "huge": lambda: self._send(lambda _: header.pack(0xFFFF, rtde_protocol.DATA)),
             "nan": lambda: active.update(nan={"actual_TCP_pose": NAN, "actual_TCP_speed": NAN}),
-            "freeze": lambda: active.update(
-                freeze=dict(fields) if request.get("all") else {"timestamp": fields["timestamp"]}
+            "freeze": lambda all=False: active.update(
+                freeze=dict(fields) if all else {"timestamp": fields["timestamp"]}
             ),
-            "rate": lambda: active.update(rate=float(request["hz"])),
+            "rate": lambda hz: active.update(rate=float(hz)),
             "close": self._close_clients,
             "protective": controller.protective_stop,
             "safeguard": controller.safeguard_stop,
             "emergency": controller.emergency_stop,
             "registers": lambda: setattr(self._server.claims, "held_by_fieldbus", True),
             "ik_fails": lambda: setattr(controller, "ik_fails", True),
-            "slider": lambda: setattr(arm, "scale", min(1.0, max(0.0, float(request["fraction"])))),
-            "remote": lambda: setattr(controller, "remote", bool(request["on"])),
-            "place": lambda: arm.place(vector6(map(float, request["tcp"]))),
-            "wall": lambda: self._add_walls(request),
+            "slider": lambda fraction: setattr(arm, "scale", min(1.0, max(0.0, float(fraction)))),
+            "remote": lambda on: setattr(controller, "remote", bool(on)),
+            "place": lambda tcp: arm.place(vector6(map(float, tcp))),
+            "wall": self._add_walls,
             "clear": self._clear,
+            "state": self._state,
             "die": lambda: os._exit(1),
         }
-        if what == "state":
-            return self._state()
-        if what not in known:
-            raise ValueError(f"unknown fault {what!r}")
-        known[what]()
-        return {"ok": True}
 
     def _state(self) -> dict[str, Any]:
         """Robot time, s; tool pose, speed and force; joints; the last targets; counts; modes by name."""
@@ -503,7 +492,7 @@ class _ControllerFaults:
         for connection, _ in self._server.rtde:
             self._server.close(connection)
 
-    def _add_walls(self, request: dict[str, Any]) -> None:
+    def _add_walls(self, **request: Any) -> None:
         arm = self._controller.arm
         arm.walls = arm.walls if set("xyz") & set(request) else []
         for axis in set("xyz") & set(request):
