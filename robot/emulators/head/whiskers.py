@@ -215,7 +215,7 @@ class _ServoDrives:
     """
 
     def __init__(self, head: Head, rate: float) -> None:
-        self.head, self.rate = head, rate
+        self.head, self.rate, self._retraction = head, rate, round(RETRACTION * rate)
         self.whisk: _Whisk | None = None
         self.sample = 0
         self._next: _Whisk | None = None
@@ -234,10 +234,6 @@ class _ServoDrives:
         if self.whisk is not None:
             return self.whisk.samples - self.sample
         return None if self._from is None else self._retraction - self.sample
-
-    @property
-    def _retraction(self) -> int:
-        return round(RETRACTION * self.rate)
 
     def receive(self, command: Command, time: float) -> None:
         """Stores a command received at a time, s (the clock of `begin`)."""

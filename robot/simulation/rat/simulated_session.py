@@ -282,7 +282,19 @@ class RatSimulation(SimulatedSource):
         self.odometry = measure_motion(config.odometry, motion, config.seed)
         # The timeline has the numbers of these boxes.
         self._boxes = [config.box, *(phase.box for phase in config.phases if phase.box is not None)]
-        self.info = _describe(config, self._boxes)
+        sizes = [(box.width, box.height) for box in self._boxes]
+        sizes += [
+            (config.box.width * phase.stretch[0], config.box.height * phase.stretch[1])
+            for phase in config.phases
+            if phase.stretch is not None
+        ]
+        width, height = np.max(sizes, axis=0).tolist()
+        settings = config.model_dump(mode="json", exclude={"path": {"file"}})
+        self.info = SourceInfo(
+            cell_size=round(ROOM * max(width, height) / CELLS, 6),
+            box=(0.0, 0.0, width, height),
+            provenance={"rat_simulation": settings},
+        )
         document = digest_of_document(self.info.provenance)
         self.digest = digest_of([document.encode(), np.ascontiguousarray(pose).tobytes()])
 
@@ -347,19 +359,3 @@ def _enter_box(path: RatPath, size: tuple[float, float], where: str) -> RatPath:
         found = f"{len(far)} positions up to {beyond.max():.3g} m outside, the first ({x:.3g}, {y:.3g}) at "
         raise InputError(where, f"{found}{path.time[far[0]]:.6g} s", box, cure)
     return path._replace(position=inside)
-
-
-def _describe(config: RatSimulationConfig, boxes: list[BoxConfig]) -> SourceInfo:
-    sizes = [(box.width, box.height) for box in boxes]
-    sizes += [
-        (config.box.width * phase.stretch[0], config.box.height * phase.stretch[1])
-        for phase in config.phases
-        if phase.stretch is not None
-    ]
-    width, height = np.max(sizes, axis=0).tolist()
-    settings = config.model_dump(mode="json", exclude={"path": {"file"}})
-    return SourceInfo(
-        cell_size=round(ROOM * max(width, height) / CELLS, 6),
-        box=(0.0, 0.0, width, height),
-        provenance={"rat_simulation": settings},
-    )
