@@ -72,10 +72,6 @@ class Arena(NamedTuple):
             free &= ~polygon_contains(polygon, points)
         return free
 
-    def is_occupied(self, centres: np.ndarray) -> np.ndarray:
-        """[...] bool, whether cells with these centres [..., 2] are in an object or outside the walls."""
-        return ~self.in_free_space(centres)
-
     def has_clearance(self, places: np.ndarray, radius: float) -> np.ndarray:
         """[...] bool, whether a disc of this radius (m) at places [..., 2] is entirely in free space."""
         room = segment_distance(wall_segments(self), places).min(axis=-1)

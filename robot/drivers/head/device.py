@@ -78,9 +78,16 @@ def open_bridge(address: str) -> Bridge:
     where = Address.parse(address)
     core = _pyusb()
     backend = _libusb() if where.host is None else SocketBackend(where.host, where.port)
+
+    def matches(device: Any) -> bool:
+        try:
+            return where.serial is None or device.serial_number == where.serial
+        except (ValueError, core.USBError):  # without permission or serial number it is another device
+            return False
+
     try:
         numbers = {"idVendor": where.vendor, "idProduct": where.product}
-        found = core.find(backend=backend, custom_match=_serial_filter(where.serial), **numbers)
+        found = core.find(backend=backend, custom_match=matches, **numbers)
         if found is None:
             raise Disconnected(errno.ENODEV, f"no head at {where}")
         return Bridge(found, str(where))
@@ -165,19 +172,6 @@ def _translate(error: Any, where: str) -> OSError | InputError:
     if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN, errno.EPROTO, errno.EIO):
         return Disconnected(errno.ENODEV, f"{where} was disconnected")
     return Stalled(error.errno or errno.EIO, f"{where}: {error}")
-
-
-def _serial_filter(serial: str | None) -> Callable[[Any], bool] | None:
-    if serial is None:
-        return None
-
-    def matches(device: Any) -> bool:
-        try:
-            return device.serial_number == serial
-        except (ValueError, _pyusb().USBError):  # without permission or serial number it is another device
-            return False
-
-    return matches
 
 
 def _pyusb() -> Any:

@@ -104,7 +104,9 @@ class _ArmProcess:
         code = self._process.poll()
         if code is None:
             return None
-        said = self.stderr_tail()
+        # The last 4 kB of output of the process and the library; pread: the writer shares the file position.
+        size = os.fstat(self._errors.fileno()).st_size
+        said = os.pread(self._errors.fileno(), 4096, max(0, size - 4096)).decode(errors="replace")
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         lines = [line for line in said.splitlines() if "what():" in line] or said.splitlines() or [""]
         last = lines[-1].replace("what():", "").strip()[-200:]
@@ -112,12 +114,6 @@ class _ArmProcess:
         if code == -signal.SIGABRT and not any(word in said for word in CONNECTION_LOST):
             return Finding(SessionOutcome.ARM_MALFORMED, detail)
         return Finding(SessionOutcome.ARM_GONE, detail)
-
-    def stderr_tail(self) -> str:
-        """The last 4 kB of output of the process and the library."""
-        # pread: the writing process shares the file position
-        size = os.fstat(self._errors.fileno()).st_size
-        return os.pread(self._errors.fileno(), 4096, max(0, size - 4096)).decode(errors="replace")
 
     def end(self, patience: float) -> bool:
         """Asks the process to stop the arm and end; False if it has not ended within `patience` s."""

@@ -80,8 +80,26 @@ def simulate_kinematic(
     start: np.ndarray,
     random: np.random.Generator,
 ) -> WhiskColumns:
-    """Contact features of whisk cycles that start at times [N] s along a path."""
-    return _add_sensor_noise(setup, _touch_walls(setup, surroundings, path, start), random)
+    """Contact features of whisk cycles that start at times [N] s along a path, with noise and faults of the
+    sensors."""
+    features = _touch_walls(setup, surroundings, path, start)
+    config, shape, alive = setup.mechanics, features.contact.shape, setup.head.alive
+    missed = random.random(shape) < config.missed
+    spurious = ~features.contact & (random.random(shape) < config.spurious)
+    anywhere = random.random(shape) * np.radians(setup.whisking.amplitude_deg)
+    noise = config.noise * random.standard_normal((2, *shape))
+    noise = noise * np.array([1.0, MEAN_NOISE_SHARE])[:, None, None]
+    smeared = config.reach_noise * random.standard_normal(shape)
+    contact = ((features.contact & ~missed) | spurious) & alive
+    touched = np.where(spurious, anywhere, features.touched)
+    highest = np.where(spurious, anywhere, features.highest + noise[1])
+    return WhiskColumns(
+        contact=contact,
+        touched=np.where(contact, touched + noise[0], 0.0),
+        held=((features.held & ~missed) | spurious) & alive,
+        highest=np.where(alive, highest, 0.0),
+        reach=np.where(contact, np.clip(features.reach + smeared, 0.0, 1.0), 0.0),
+    )
 
 
 def _touch_walls(
@@ -145,24 +163,3 @@ def _apply_feedback(setup: HeadSetup, reading: np.ndarray, push: np.ndarray) -> 
         taken = np.where(led, whisking.follow * neighbour_max(taken, head.shape), taken)
         reading = np.where(led, np.maximum(reading - push * taken, 0.0), reading)
     return reading, taken
-
-
-def _add_sensor_noise(setup: HeadSetup, features: WhiskColumns, random: np.random.Generator) -> WhiskColumns:
-    """Add noise and faults of the sensors."""
-    config, shape, alive = setup.mechanics, features.contact.shape, setup.head.alive
-    missed = random.random(shape) < config.missed
-    spurious = ~features.contact & (random.random(shape) < config.spurious)
-    anywhere = random.random(shape) * np.radians(setup.whisking.amplitude_deg)
-    noise = config.noise * random.standard_normal((2, *shape))
-    noise = noise * np.array([1.0, MEAN_NOISE_SHARE])[:, None, None]
-    smeared = config.reach_noise * random.standard_normal(shape)
-    contact = ((features.contact & ~missed) | spurious) & alive
-    touched = np.where(spurious, anywhere, features.touched)
-    highest = np.where(spurious, anywhere, features.highest + noise[1])
-    return WhiskColumns(
-        contact=contact,
-        touched=np.where(contact, touched + noise[0], 0.0),
-        held=((features.held & ~missed) | spurious) & alive,
-        highest=np.where(alive, highest, 0.0),
-        reach=np.where(contact, np.clip(features.reach + smeared, 0.0, 1.0), 0.0),
-    )
