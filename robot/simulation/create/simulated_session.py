@@ -94,10 +94,10 @@ class CreateSimulation(SimulatedSource):
         self.config = config
         self.arena = make_arena(config.arena, config.seed)
         walls, noise = wall_segments(self.arena), stream(config.seed, "strain")
-        robot = CreateRobot(config.behaviour, config.whiskers, walls, noise)
+        robot = _CreateRobot(config.behaviour, config.whiskers, walls, noise)
         self.whiskers = len(robot.whiskers.base)
         start, random = robot.at(self.arena.start), stream(config.seed, "behaviour")
-        self.steps: list[CreateStep] = []
+        self.steps: list[_CreateStep] = []
         step, doing, time = start, MachineState(CreateState.FWD1), 0.0
         while (len(self.steps) < config.reports) if config.reports else (time < 60 * config.minutes):
             before, command = step, wheel_command(config.behaviour, doing)
@@ -163,7 +163,7 @@ def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.ran
     room += APPROACH * random.uniform(0.5, 1.0) * towards[0]
     along = HALF_WALL * np.array([np.cos(angle), np.sin(angle)])
     wall = np.concatenate([room * towards - along, room * towards + along])[None]
-    robot = CreateRobot(behaviour, whiskers, wall, random)
+    robot = _CreateRobot(behaviour, whiskers, wall, random)
     step = robot.at(np.zeros(3))
     while step.moment == StepEnd.FREE and step.pose[0] < 2 * APPROACH + whiskers.length:
         step = robot.step(step, CreateState.FWD1, WheelCommand(behaviour.fast, 0.0, behaviour.step))
@@ -175,11 +175,11 @@ def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.ran
         raise InputError("create_simulation.behaviour.contact", found, expected)
     patient = behaviour.model_copy(update={"safety": np.inf, "least": RECORD_TIME})
     command = WheelCommand(behaviour.slow, 0.0, RECORD_TIME)
-    push = CreateRobot(patient, whiskers, wall, random).step(step, CreateState.FWD2, command)
+    push = _CreateRobot(patient, whiskers, wall, random).step(step, CreateState.FWD2, command)
     return make_report(config, push, Odometry(behaviour.slow * RECORD_TIME, 0.0, 0.0, RECORD_TIME))
 
 
-def make_report(config: CreateSimulationConfig, step: CreateStep, odometry: Odometry) -> Report:
+def make_report(config: CreateSimulationConfig, step: _CreateStep, odometry: Odometry) -> Report:
     """A step as a reading."""
     return Report(
         odometry=odometry,
@@ -210,7 +210,7 @@ MIN_DURATION = 1e-6
 """Shortest duration of a motion, s."""
 
 
-class CreateStep(NamedTuple):
+class _CreateStep(NamedTuple):
     """One motion of the robot.
 
     Attributes:
@@ -228,7 +228,7 @@ class CreateStep(NamedTuple):
     strain: np.ndarray
 
 
-class CreateRobot:
+class _CreateRobot:
     """The Create among walls [S, 4] (x1, y1, x2, y2, m).
 
     Attributes:
@@ -246,13 +246,13 @@ class CreateRobot:
         self.whiskers = fixed_whiskers(whiskers)
         self._random = random
 
-    def at(self, pose: np.ndarray) -> CreateStep:
+    def at(self, pose: np.ndarray) -> _CreateStep:
         """The state before the first motion from a pose."""
         free = np.zeros(len(self.whiskers.base), int)
         none = np.zeros((0, len(free), 2))
-        return CreateStep(CreateState.FWD1, StepEnd.FREE, 0.0, pose, free, free.astype(bool), none)
+        return _CreateStep(CreateState.FWD1, StepEnd.FREE, 0.0, pose, free, free.astype(bool), none)
 
-    def step(self, last: CreateStep, state: CreateState, command: WheelCommand) -> CreateStep:
+    def step(self, last: _CreateStep, state: CreateState, command: WheelCommand) -> _CreateStep:
         """Execute a motion until its planned or early end."""
         config = self.behaviour
         count = planned_rows(config, command)
@@ -280,4 +280,4 @@ class CreateRobot:
             bent_then = bend_whiskers(self.whiskers, poses_sampled, near, last.side)
             strain = base_strains(self.sensors, self.whiskers, bent_then)
             sampled = sample_strain(self.sensors, strain, self.whiskers.alive, self._random)
-        return CreateStep(state, moment, duration, poses[row], bent.side[row], contact, sampled)
+        return _CreateStep(state, moment, duration, poses[row], bent.side[row], contact, sampled)

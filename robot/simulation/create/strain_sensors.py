@@ -51,11 +51,6 @@ class Bending(NamedTuple):
     side: np.ndarray
 
 
-def base_strain(fan: FixedWhiskers, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Surface strain at the base, M r0 / (E I), with the sign of the rotation."""
-    return 3 * fan.radius * (1 / reach - fan.taper) * turn
-
-
 def shaft_tilt(fan: FixedWhiskers, reach: np.ndarray) -> np.ndarray:
     """Ratio of the shaft's tilt at the contact to the rotation of the line from base to contact."""
     narrow = fan.taper * reach
@@ -285,7 +280,8 @@ def bend_whiskers(fan: FixedWhiskers, pose: np.ndarray, segments: np.ndarray, si
 
 def base_strains(config: WhiskersConfig, fan: FixedWhiskers, bent: Bending) -> np.ndarray:
     """Horizontal and vertical strain [T, W, 2] of bent whiskers, without noise."""
-    across = base_strain(fan, bent.turn, bent.reach)
+    # The surface strain at the base, M r0 / (E I), with the sign of the rotation.
+    across = 3 * fan.radius * (1 / bent.reach - fan.taper) * bent.turn
     # The force along the shaft bends it by the lever of its droop, the force across it by its length.
     along = np.tan(np.minimum(bent.lean + np.arctan(config.friction), MAX_LEAN))
     down = np.tan(np.radians(config.droop_deg)) * np.abs(across) * along
