@@ -200,7 +200,7 @@ def true_grid(arena: Arena, grid: OccupancyGrid) -> GridTruth:
     there = compose(arena.start, np.concatenate([place, np.zeros((*place.shape[:2], 1))], axis=2))[..., :2]
     ends = wall_segments(arena).reshape(-1, 2)
     seen = compose(inverse(arena.start), np.column_stack([ends, np.zeros(len(ends))]))[:, :2]
-    return GridTruth(arena.is_occupied(there), arena.is_enclosed(there), seen.reshape(-1, 4))
+    return GridTruth(~arena.in_free_space(there), arena.is_enclosed(there), seen.reshape(-1, 4))
 
 
 def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:

@@ -55,9 +55,7 @@ LOWEST = 19
 def become_urgent() -> None:
     """Gives all threads of this process the priority of control, as far as the system allows."""
     for thread in _threads():
-        _set_niceness(thread, URGENT)
-        with contextlib.suppress(OSError, AttributeError):
-            os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(1))
+        _set(thread, URGENT, getattr(os, "SCHED_RR", 0))
 
 
 @contextlib.contextmanager
@@ -97,10 +95,6 @@ def _set(thread: int, niceness: int, policy: int) -> None:
     """Sets nice level and policy of a thread (0: the ordinary one; the others have the least priority)."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(thread, policy, os.sched_param(os.sched_get_priority_min(policy)))
-    _set_niceness(thread, niceness)
-
-
-def _set_niceness(thread: int, niceness: int) -> None:
     with contextlib.suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, thread, niceness)
 

@@ -1,11 +1,16 @@
-"""The addresses on which emulators listen: loopback, unless the network is asked for."""
+"""The addresses on which emulators listen: loopback, unless the network is asked for; and fault requests.
+
+A fault request is an object {"do": name, ...} with the arguments of the fault.
+"""
 
 from __future__ import annotations
 
 import errno
 import ipaddress
-from collections.abc import Iterator
+import json
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 from tactile.base.errors import InputError
 
@@ -39,3 +44,25 @@ def is_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return False
+
+
+def do_fault(known: Mapping[str, Callable[..., Any]], request: Mapping[str, Any]) -> dict[str, Any]:
+    """Executes a fault request; returns what its function does, {"ok": True} if nothing.
+
+    Raises:
+        ValueError, TypeError: unknown fault or invalid arguments.
+    """
+    arguments = dict(request)
+    name = str(arguments.pop("do", ""))
+    if name not in known:
+        raise ValueError(f"{name!r}; known are {', '.join(known)}")
+    return known[name](**arguments) or {"ok": True}
+
+
+def answer_fault(line: str | bytes, do: Callable[[dict[str, Any]], dict[str, Any]]) -> bytes:
+    """The answer to a line of JSON with a fault request, or the error in it, as such a line."""
+    try:
+        answer = do(dict(json.loads(line)))
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+        answer = {"ok": False, "error": f"{type(error).__name__}: {error}"}
+    return json.dumps(answer).encode() + b"\n"

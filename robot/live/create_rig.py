@@ -24,9 +24,8 @@ from robot.simulation.create.state_machine import (
     CreateState,
     MachineState,
     WheelCommand,
-    early_end,
+    motion_end,
     next_state,
-    planned_end,
     planned_rows,
     wheel_command,
 )
@@ -333,9 +332,7 @@ def _execute(
         rows = monitor.rows(last + 1)
         bumped += [rig.bumped] * (len(rows) - len(bumped))
         if len(rows):
-            end = early_end(behaviour, doing.state, _known(rig, rows), np.array(bumped), before, last)
-            if end is None and len(rows) > last:
-                end = planned_end(doing.state, last)
+            end = motion_end(behaviour, doing.state, _known(rig, rows), np.array(bumped), before, last)
         if end is None and now - driven > RENEW:
             driven = _drive(rig, command)
     row, moment = end

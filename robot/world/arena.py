@@ -72,10 +72,6 @@ class Arena(NamedTuple):
             free &= ~polygon_contains(polygon, points)
         return free
 
-    def is_occupied(self, centres: np.ndarray) -> np.ndarray:
-        """[...] bool, whether cells with these centres [..., 2] are in an object or outside the walls."""
-        return ~self.in_free_space(centres)
-
     def has_clearance(self, places: np.ndarray, radius: float) -> np.ndarray:
         """[...] bool, whether a disc of this radius (m) at places [..., 2] is entirely in free space."""
         room = segment_distance(wall_segments(self), places).min(axis=-1)
@@ -99,26 +95,26 @@ def read_arena(path: File) -> Arena:
         raise InputError(str(path), f"is not text ({error})", "an arena file in UTF-8") from None
     read = [line for number, content in enumerate(lines, 1) if (line := _parse_line(path, number, content))]
     single: dict[str, _Line] = {}
-    for line in read:
-        if line.word in REQUIRED_LINES and line.word in single:
-            raise InputError(line.places[0], f"another `{line.word}`", "one", "remove one of them")
-        single[line.word] = line
+    for word, values, places in read:
+        if word in REQUIRED_LINES and word in single:
+            raise InputError(places[0], f"another `{word}`", "one", "remove one of them")
+        single[word] = word, values, places
     for word, meaning in REQUIRED_LINES.items():
         if word not in single:
             raise InputError(str(path), f"has no line `{word}`", f"`{LINE_FORMS[word]}`, {meaning}")
     outer = _polygon(single["outer"])
     objects: list[np.ndarray] = []
     for line in read:
-        if line.word not in REQUIRED_LINES:
+        if line[0] not in REQUIRED_LINES:
             polygon = _polygon(line)
-            _check_position(line, polygon, outer, objects)
+            _check_position(line[2][0], polygon, outer, objects)
             objects.append(polygon)
-    x, y, heading = single["start"].values
+    _, (x, y, heading), places = single["start"]
     made = Arena(path.stem, outer, tuple(objects), np.array([x, y, np.radians(heading)]))
     if not made.has_clearance(made.start[:2], START_CLEARANCE):
         found = f"a start at {x:g} {y:g} too close to a wall or object"
         expected = f"{START_CLEARANCE:g} m of free space around it"
-        raise InputError(single["start"].places[1], found, expected)
+        raise InputError(places[1], found, expected)
     return made
 
 
@@ -135,12 +131,8 @@ def arena_text(arena: Arena) -> str:
     return "\n".join(lines) + "\n"
 
 
-class _Line(NamedTuple):
-    """A line: its keyword, its numbers, and the position of each word."""
-
-    word: str
-    values: np.ndarray
-    places: list[str]
+_Line = tuple[str, np.ndarray, list[str]]
+"""A line: its keyword, its numbers, and the position of each word."""
 
 
 def _parse_line(path: File, number: int, content: str) -> _Line | None:
@@ -169,42 +161,43 @@ def _parse_line(path: File, number: int, content: str) -> _Line | None:
         raise InputError(places[0], f"{count} numbers", f"`{LINE_FORMS[word]}`")
     if word == "square" and values[2] <= 0:
         raise InputError(places[3], f"a side of {values[2]:g} m", "a side above 0 m")
-    return _Line(word, np.array(values), places)
+    return word, np.array(values), places
 
 
 def _polygon(line: _Line) -> np.ndarray:
     """The corners of a line's polygon, checked to enclose an area."""
-    if line.word == "square":
-        return square(line.values[:2], line.values[2], np.radians(line.values[3]))
-    corners = line.values.reshape(-1, 2)
+    word, values, places = line
+    if word == "square":
+        return square(values[:2], values[2], np.radians(values[3]))
+    corners = values.reshape(-1, 2)
     sides = polygon_edges(corners)
     short = np.hypot(*(sides[:, 2:] - sides[:, :2]).T) < 1e-9
     if short.any():
         again = (int(np.argmax(short)) + 1) % len(corners)
-        where, cure = line.places[1 + 2 * again], "leave it out: the polygon is closed automatically"
+        where, cure = places[1 + 2 * again], "leave it out: the polygon is closed automatically"
         raise InputError(where, "the same corner twice in a row", "different successive corners", cure)
     crosses = np.argwhere(segments_cross(sides, sides))
     if len(crosses):
         one, other = sorted(crosses[0].tolist())
         found = f"walls that cross: side {one + 1} and side {other + 1}"
-        raise InputError(line.places[1 + 2 * one], found, "corners in order around the area")
+        raise InputError(places[1 + 2 * one], found, "corners in order around the area")
     if abs(polygon_area(corners)) < 1e-9:
-        raise InputError(line.places[0], "corners on one line", "corners that enclose an area")
+        raise InputError(places[0], "corners on one line", "corners that enclose an area")
     return corners
 
 
-def _check_position(line: _Line, polygon: np.ndarray, outer: np.ndarray, others: list[np.ndarray]) -> None:
+def _check_position(place: str, polygon: np.ndarray, outer: np.ndarray, others: list[np.ndarray]) -> None:
     """Raise an error for an object outside the arena or overlapping another one."""
     middle = (polygon + np.roll(polygon, -1, axis=0)) / 2
     probe = np.vstack([polygon, middle]) * (1 - 1e-6) + polygon.mean(axis=0) * 1e-6  # may touch the wall
     sides = polygon_edges(polygon)
     if segments_cross(sides, polygon_edges(outer)).any() or not polygon_contains(outer, probe).all():
-        raise InputError(line.places[0], "an object outside the walls", "objects within `outer`")
+        raise InputError(place, "an object outside the walls", "objects within `outer`")
     for number, other in enumerate(others, 1):
         inside = polygon_contains(other, probe).any() or polygon_contains(polygon, other.mean(axis=0))
         if inside or segments_cross(sides, polygon_edges(other)).any():
             found = f"an object that overlaps object {number}"
-            raise InputError(line.places[0], found, "objects that do not overlap", "move one of them")
+            raise InputError(place, found, "objects that do not overlap", "move one of them")
 
 
 Share = Annotated[float, Field(ge=0, le=1)]

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.world.walls import Walls
+from robot.world.walls import Walls, polygon_area
 from tactile.base.bounded import read_text
 from tactile.base.errors import InputError
 
@@ -68,9 +68,12 @@ class Maze(NamedTuple):
 
     def neighbours(self, cell: Cell) -> list[Cell]:
         """Reachable neighbours of a cell, in the order east, north, west, south."""
+        return [other for other in self.around(cell) if self.is_open(cell, other)]
+
+    def around(self, cell: Cell) -> list[Cell]:
+        """Cells beside a cell, in the same order, with or without a wall in between."""
         x, y = cell
-        beside = [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)]
-        return [b for b in beside if self.is_inside(b) and self.is_open(cell, b)]
+        return [b for b in ((x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)) if self.is_inside(b)]
 
     def is_inside(self, cell: Cell) -> bool:
         """Whether the maze has a cell."""
@@ -99,9 +102,7 @@ def tree_maze(columns: int, rows: int, random: np.random.Generator) -> Maze:
     way: list[Cell] = [(0, 0)]
     seen = {way[0]}
     while way:
-        column, row = way[-1]
-        around = [(column + 1, row), (column, row + 1), (column - 1, row), (column, row - 1)]
-        onward = [cell for cell in around if maze.is_inside(cell) and cell not in seen]
+        onward = [cell for cell in maze.around(way[-1]) if cell not in seen]
         if not onward:
             way.pop()
             continue
@@ -162,16 +163,11 @@ def _trace_outline(blob: np.ndarray, random: np.random.Generator) -> list[Cell]:
     """The cells of the outline in counter-clockwise order from a random one."""
     # Square (i, j) lies between the centres of cells i - 1 and i, j - 1 and j; the region is on the left.
     ways: dict[Cell, Cell] = {}
+    padded = np.pad(blob, 1)
     for i, j in np.argwhere(blob).tolist():
-        padded = np.pad(blob, 1)
-        if not padded[i + 1, j]:
-            ways[i - 1, j - 1] = (i, j - 1)
-        if not padded[i + 2, j + 1]:
-            ways[i, j - 1] = (i, j)
-        if not padded[i + 1, j + 2]:
-            ways[i, j] = (i - 1, j)
-        if not padded[i, j + 1]:
-            ways[i - 1, j] = (i - 1, j - 1)
+        corners = [(i - 1, j - 1), (i, j - 1), (i, j), (i - 1, j)]
+        beside = padded[i + 1, j], padded[i + 2, j + 1], padded[i + 1, j + 2], padded[i, j + 1]
+        ways |= {corners[k]: corners[(k + 1) % 4] for k in range(4) if not beside[k]}
     start = sorted(ways)[int(random.integers(len(ways)))]
     loop = [start]
     while (following := ways[loop[-1]]) != start:
@@ -191,7 +187,7 @@ def change_walls(
     for name, pairs, there in (("added", added, False), ("removed", removed, True)):
         for number, (a, b) in enumerate(pairs):
             where, cells = f"simulation.maze.{name}[{number}]", f"cells {tuple(a)} and {tuple(b)}"
-            if not (maze.is_inside(a) and maze.is_inside(b)) or abs(a[0] - b[0]) + abs(a[1] - b[1]) != 1:
+            if not maze.is_inside(a) or tuple(b) not in maze.around(a):
                 raise InputError(where, cells, "two neighbouring cells of the maze")
             wall, place = changed.between_cells(a, b)
             if wall[place] != there:
@@ -381,9 +377,7 @@ def make_anticlockwise(loop: Sequence[Cell]) -> list[Cell]:
         twice = next((cell for k, cell in enumerate(loop) if cell in loop[:k]), None)
         found = f"{len(loop)} cells" if twice is None else f"cell {twice} twice"
         raise InputError("simulation.path.loop", found, "at least four different cells")
-    x, y = np.array(loop).T
-    area = np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
-    return list(loop) if area > 0 else [loop[0], *loop[:0:-1]]
+    return list(loop) if polygon_area(np.array(loop)) > 0 else [loop[0], *loop[:0:-1]]
 
 
 def check_route(maze: Maze, way: Sequence[Cell], where: str = "simulation.path.cells") -> None:

@@ -316,12 +316,6 @@ def make_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, li
     Raises:
         InputError: the maze or its loop is not possible, or the path needs a loop and there is none.
     """
-    maze, loop = _make_first_maze(config, path, seed)
-    return change_walls(maze, config.added, config.removed), loop
-
-
-def _make_first_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, list[Cell]]:
-    """The maze before walls were added and removed, and its loop."""
     seed = maze_seed(config, seed)
     loop: list[Cell] = []
     maze = read_maze(config.file) if config.file else closed_maze(config.columns, config.rows)
@@ -334,14 +328,14 @@ def _make_first_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[M
             cure = "set the loop, or explore instead of circuits"
             expected = "the cells of a loop in the maze"
             raise InputError("simulation.path.loop", "circuits without a loop", expected, cure)
-        return maze, loop
-    if config.kind == "tree" and (path.circuits or loop):
-        cure = "explore, or use `simulation.maze.kind: loop`"
-        raise InputError("simulation.path", "circuits in a maze without loops", "an exploration", cure)
-    if config.kind == "loop" and not loop:
-        loop = random_loop(config.columns, config.rows, config.loop, stream(seed, "maze.loop"))
-    walls = stream(seed, "maze.walls")
-    return _draw_walls(config, config.columns, config.rows, loop, walls), loop
+    else:
+        if config.kind == "tree" and (path.circuits or loop):
+            cure = "explore, or use `simulation.maze.kind: loop`"
+            raise InputError("simulation.path", "circuits in a maze without loops", "an exploration", cure)
+        if config.kind == "loop" and not loop:
+            loop = random_loop(config.columns, config.rows, config.loop, stream(seed, "maze.loop"))
+        maze = _draw_walls(config, config.columns, config.rows, loop, stream(seed, "maze.walls"))
+    return change_walls(maze, config.added, config.removed), loop
 
 
 def _draw_walls(

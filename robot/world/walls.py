@@ -51,22 +51,26 @@ class Surroundings:
 
     Args:
         head: all whisker planes must contain the vertical axis of base_link.
+
+    Attributes:
+        radius: [W] m, of the bases from that axis. outwards: [W, 2] directions of the planes. opening: [W]
+            rad, of the whiskers at rest from straight down.
     """
 
     def __init__(self, walls: Walls, head: Head) -> None:
         self.walls, self.head = walls, head
-        base = np.hypot(head.base[:, 0], head.base[:, 1])
-        outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)
-        self._radius, self._azimuth = base, np.arctan2(outwards[:, 1], outwards[:, 0])
-        self._opening = np.arctan2(np.hypot(head.rest[:, 0], head.rest[:, 1]), -head.rest[:, 2])
-        self.range = float((base + head.length).max())
-        self._rays, self._ray = np.unique(np.round(self._azimuth, 12), return_inverse=True)
+        self.radius = np.hypot(head.base[:, 0], head.base[:, 1])
+        self.outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)
+        self.opening = np.arctan2(np.hypot(head.rest[:, 0], head.rest[:, 1]), -head.rest[:, 2])
+        self._range = float((self.radius + head.length).max())
+        azimuth = np.arctan2(self.outwards[:, 1], self.outwards[:, 0])
+        self._rays, self._ray = np.unique(np.round(azimuth, 12), return_inverse=True)
         self._near: dict[tuple[int, int], np.ndarray] = {}
 
     def contact(self, pose: np.ndarray) -> Contact:
         """First contacts of all whiskers of a resting head at poses [P, 3] (m, m, rad)."""
         pose = np.asarray(pose, float)
-        count, whiskers = len(pose), len(self._radius)
+        count, whiskers = len(pose), len(self.radius)
         angle = np.full((count, whiskers), NO_CONTACT)
         reach, wall = np.zeros((count, whiskers)), np.full((count, whiskers), -1)
         buckets = np.floor(pose[:, :2] / BUCKET_SIDE).astype(int)
@@ -80,8 +84,8 @@ class Surroundings:
     def _nearby_boxes(self, i: int, j: int) -> np.ndarray:
         """Boxes within range of any point of an index square."""
         if (i, j) not in self._near:
-            low = np.array([i, j]) * BUCKET_SIDE - self.range
-            high = np.array([i + 1, j + 1]) * BUCKET_SIDE + self.range
+            low = np.array([i, j]) * BUCKET_SIDE - self._range
+            high = np.array([i + 1, j + 1]) * BUCKET_SIDE + self._range
             box = self.walls.box
             inside = (box[:, 0] <= high[0]) & (box[:, 2] >= low[0])
             inside &= (box[:, 1] <= high[1]) & (box[:, 3] >= low[1])
@@ -92,9 +96,9 @@ class Surroundings:
         self, pose: np.ndarray, near: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         enter, leave = self._crossings(pose, self.walls.box[near])  # [P, A, B]
-        met = np.full((len(pose), len(self._radius)), NO_CONTACT)
+        met = np.full((len(pose), len(self.radius)), NO_CONTACT)
         reach, wall = np.zeros(met.shape), np.full(met.shape, -1)
-        row, ray, box = np.nonzero((leave > enter) & (leave > 0) & (enter < self.range))
+        row, ray, box = np.nonzero((leave > enter) & (leave > 0) & (enter < self._range))
         d1, d2, top = enter[row, ray, box], leave[row, ray, box], self.walls.height[near[box]]
         # A box crossed by a ray is within the plane of every whisker in that direction.
         crossing, whisker = np.nonzero(ray[:, None] == self._ray)
@@ -123,7 +127,7 @@ class Surroundings:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Protraction at which whiskers w [N] touch boxes d1 to d2 m away, and the position along the
         shaft."""
-        radius, length, rest = self._radius[w], self.head.length[w], self._opening[w]
+        radius, length, rest = self.radius[w], self.head.length[w], self.opening[w]
         drop = self.head.base[w, 2] - top
         # Distance of the tip from the axis when it is as high as the top of the box.
         opening = np.arccos(np.clip(drop / length, -1, 1))

@@ -37,7 +37,7 @@ class ControlLoop:
     """
 
     def __init__(self, config: CreateConfig, link: SerialLink, clock: Callable[[], float]) -> None:
-        self._config, self._link, self._clock = config, link, clock
+        self._config, self.link, self._clock = config, link, clock
         self._lock = threading.Lock()
         self._command = (0, 0, -math.inf)  # requested speeds, right and left, mm/s; time of the request, s
         self._reply_time = clock()
@@ -46,11 +46,6 @@ class ControlLoop:
         self._enter_safe, self._pause_end = False, -math.inf
         self.active_stop: StopEvent | None = None
         self.last_reply: protocol.SensorReply | None = None
-
-    @property
-    def counts(self) -> LinkCounts:
-        """Counts of queries so far."""
-        return self._link.counts
 
     def steer(self, forward: float, turn: float) -> None:
         """Requests a motion, m/s and rad/s; it ends after `patience`.
@@ -84,7 +79,7 @@ class ControlLoop:
     def gap(self) -> bool:
         """Whether a reply was lost since the last call, possibly with its motion."""
         with self._lock:
-            before, self._outstanding = self._outstanding, self._link.counts.outstanding
+            before, self._outstanding = self._outstanding, self.link.counts.outstanding
             return self._outstanding > before
 
     def halt(self, reason: StopReason, detail: str) -> None:
@@ -100,7 +95,7 @@ class ControlLoop:
         try:
             if self._enter_safe:
                 self._enter_safe, self._pause_end = False, self._clock() + PAUSE
-                self._link.send(protocol.SAFE)
+                self.link.send(protocol.SAFE)
                 return
             found = self._read()
             right, left, requested = self._command  # read once: another thread may replace it
@@ -114,13 +109,13 @@ class ControlLoop:
                 self.halt(StopReason.BUMPED, (found.bumps & Bumps.BUMPED).describe())
             fresh = self._clock() - requested <= self._config.patience
             drives = fresh and self.active_stop is None
-            self._link.send(protocol.drive(right, left) if drives else protocol.STOP)
+            self.link.send(protocol.drive(right, left) if drives else protocol.STOP)
         except Unplugged as error:
             self.halt(StopReason.UNPLUGGED, str(error))
 
     def _read(self) -> protocol.SensorReply | None:
         try:
-            found = self._link.ask(self._clock() - self._reply_time)
+            found = self.link.ask(self._clock() - self._reply_time)
         except (NoReply, BadReply) as error:
             since = self._clock() - self._reply_time
             if since >= self._config.silence:

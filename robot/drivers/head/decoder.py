@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -129,6 +129,12 @@ class Frames(NamedTuple):
     flags: np.ndarray
     values: np.ndarray
 
+    @classmethod
+    def blank(cls, whiskers: int, rows: int = 0) -> Frames:
+        """Frames of zeros, by default none, of a head with this number of whiskers."""
+        number, flags = np.zeros(rows, np.int64), np.zeros(rows, np.uint8)
+        return cls(number, number.copy(), flags, np.zeros((rows, whiskers, CHANNELS), np.int16))
+
     def select(self, first: int, last: int) -> Frames:
         """The frames from first to last, both included, ordered by sequence number."""
         rows = np.flatnonzero((self.sequence >= first) & (self.sequence <= last))
@@ -160,29 +166,9 @@ class DecoderCounts(NamedTuple):
     restarts: int = 0
 
 
-class FrameDecoder(Protocol):
-    """Interface of a decoder of a bridge's stream."""
-
-    @property
-    def counts(self) -> DecoderCounts:
-        """Counts so far."""
-        ...
-
-    def feed(self, data: bytes) -> Frames:
-        """The samples completed by these bytes."""
-        ...
-
-    def restart(self, time: int | None = None) -> None:
-        """Starts a new stream; a partial frame is dropped.
-
-        Args:
-            time: approximate device clock now, us; None: the time of the next frame starts the stream.
-        """
-        ...
-
-
 class Decoder:
-    """Decodes the frames of `robot.drivers.head.usb_protocol`.
+    """Decodes the frames of `robot.drivers.head.usb_protocol`. A decoder of another stream needs the members
+    `counts`, `feed` and `restart`.
 
     Args:
         whiskers: number on the head. channels: per whisker.
@@ -202,6 +188,7 @@ class Decoder:
 
     @property
     def counts(self) -> DecoderCounts:
+        """Counts so far."""
         return DecoderCounts(
             good=self._good,
             bad=self._bad,
@@ -218,12 +205,18 @@ class Decoder:
         return len(self._rest)
 
     def restart(self, time: int | None = None) -> None:
+        """Starts a new stream; a partial frame is dropped.
+
+        Args:
+            time: approximate device clock now, us; None: the time of the next frame starts the stream.
+        """
         self._skipped += len(self._rest)
         self._rest = b""
         self._numbering.restart()
         self._time = time
 
     def feed(self, data: bytes) -> Frames:
+        """The samples completed by these bytes."""
         buffer = self._rest + data if self._rest else bytes(data)
         runs: list[bytes] = []
         place = 0
@@ -336,25 +329,11 @@ def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
     return Cycle(time, angle, deflection, cut.odometry)
 
 
-def empty_frames(whiskers: int) -> Frames:
-    """A block without frames, of a head with this number of whiskers."""
-    return Frames(
-        np.zeros(0, np.int64),
-        np.zeros(0, np.int64),
-        np.zeros(0, np.uint8),
-        np.zeros((0, whiskers, CHANNELS), np.int16),
-    )
-
-
 class FrameWindow:
-    """The most recent frames, in blocks as they arrived.
+    """The most recent frames of a head with this number of whiskers, in blocks as they arrived."""
 
-    Args:
-        empty: a block without frames, which gives the shape.
-    """
-
-    def __init__(self, empty: Frames) -> None:
-        self._empty = empty
+    def __init__(self, whiskers: int) -> None:
+        self._empty = Frames.blank(whiskers)
         self._blocks: deque[Frames] = deque()
         self._count = 0
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from robot.drivers.head.driver_config import Address
 from robot.drivers.head.emulated_cable import SocketBackend
@@ -69,38 +69,6 @@ class HeadIdentity(NamedTuple):
             ) from None
 
 
-class Bridge(Protocol):
-    """Connection to a head. Used by one thread at a time."""
-
-    def read(self, size: int, timeout: float) -> bytes:
-        """Reads at most `size` bytes of the stream; none if none arrive within `timeout` s.
-
-        Raises:
-            Disconnected, Stalled.
-        """
-        ...
-
-    def write(self, data: bytes) -> None:
-        """Sends a command.
-
-        Raises:
-            Disconnected, Stalled.
-        """
-        ...
-
-    def request(self, request: Request) -> bytes:
-        """Sends a control request and returns the answer.
-
-        Raises:
-            Disconnected, Stalled: unknown request, or no answer.
-        """
-        ...
-
-    def close(self) -> None:
-        """Releases the device."""
-        ...
-
-
 def open_bridge(address: str) -> Bridge:
     """Opens the bridge at an address (`HeadLinkConfig.address`).
 
@@ -110,18 +78,28 @@ def open_bridge(address: str) -> Bridge:
     where = Address.parse(address)
     core = _pyusb()
     backend = _libusb() if where.host is None else SocketBackend(where.host, where.port)
+
+    def matches(device: Any) -> bool:
+        try:
+            return where.serial is None or device.serial_number == where.serial
+        except (ValueError, core.USBError):  # without permission or serial number it is another device
+            return False
+
     try:
         numbers = {"idVendor": where.vendor, "idProduct": where.product}
-        found = core.find(backend=backend, custom_match=_serial_filter(where.serial), **numbers)
+        found = core.find(backend=backend, custom_match=matches, **numbers)
         if found is None:
             raise Disconnected(errno.ENODEV, f"no head at {where}")
-        return UsbBridge(found, str(where))
+        return Bridge(found, str(where))
     except core.USBError as error:
         raise _translate(error, str(where)) from error
 
 
-class UsbBridge:
-    """A pyusb device as a `Bridge`; claims the interface."""
+class Bridge:
+    """Connection to a head: a pyusb device, whose interface it claims. Used by one thread at a time.
+
+    All methods raise `Disconnected` or `Stalled`. Another bridge needs the same four.
+    """
 
     def __init__(self, device: Any, where: str) -> None:
         self._device, self._where = device, where
@@ -137,15 +115,18 @@ class UsbBridge:
         util.claim_interface(device, INTERFACE)
 
     def read(self, size: int, timeout: float) -> bytes:
+        """Reads at most `size` bytes of the stream; none if none arrive within `timeout` s."""
         patience = max(1, round(1000 * timeout))
         got = self._try(lambda: self._device.read(ENDPOINT_IN, size, patience), ENDPOINT_IN)
         return b"" if got is None else got.tobytes()
 
     def write(self, data: bytes) -> None:
+        """Sends a command."""
         if self._try(lambda: self._device.write(ENDPOINT_OUT, data, TIMEOUT), ENDPOINT_OUT) is None:
             raise Stalled(errno.ETIMEDOUT, "commands are not accepted")
 
     def request(self, request: Request) -> bytes:
+        """Sends a control request and returns the answer; `Stalled` if it is unknown or not answered."""
         if request in (Request.START, Request.STOP):
             answer = self._try(lambda: self._device.ctrl_transfer(REQUEST_OUT, request, 0, 0, b"", TIMEOUT))
         else:
@@ -156,6 +137,7 @@ class UsbBridge:
         return b"" if isinstance(answer, int) else answer.tobytes()
 
     def close(self) -> None:
+        """Releases the device."""
         from usb import util
 
         util.dispose_resources(self._device)
@@ -190,19 +172,6 @@ def _translate(error: Any, where: str) -> OSError | InputError:
     if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN, errno.EPROTO, errno.EIO):
         return Disconnected(errno.ENODEV, f"{where} was disconnected")
     return Stalled(error.errno or errno.EIO, f"{where}: {error}")
-
-
-def _serial_filter(serial: str | None) -> Callable[[Any], bool] | None:
-    if serial is None:
-        return None
-
-    def matches(device: Any) -> bool:
-        try:
-            return device.serial_number == serial
-        except (ValueError, _pyusb().USBError):  # without permission or serial number it is another device
-            return False
-
-    return matches
 
 
 def _pyusb() -> Any:

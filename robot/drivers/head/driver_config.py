@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 
 from pydantic import PositiveFloat, field_validator
 
+from robot.drivers.head.emulated_cable import PORT
 from robot.drivers.head.usb_protocol import PRODUCT, VENDOR
 from tactile.base.settings import Settings
 
@@ -35,7 +36,6 @@ class HeadLinkConfig(Settings):
         return address
 
 
-EMULATOR_PORT = 30100
 _USB = re.compile(r"usb(?::([0-9a-f]{4}):([0-9a-f]{4})(?::(\S+))?)?", re.IGNORECASE)
 _HOST = re.compile(r"([\w.-]+)(?::(\d{1,5}))?")
 
@@ -52,7 +52,7 @@ class Address(NamedTuple):
     product: int = PRODUCT
     serial: str | None = None
     host: str | None = None
-    port: int = EMULATOR_PORT
+    port: int = PORT
 
     @classmethod
     def parse(cls, text: str) -> Address:
@@ -66,7 +66,7 @@ class Address(NamedTuple):
             return cls(int(vendor, 16), int(product, 16), serial) if vendor else cls()
         found = _HOST.fullmatch(text)
         if found and not text.lower().startswith("usb") and int(found[2] or 0) < 65536:
-            return cls(host=found[1], port=int(found[2] or EMULATOR_PORT))
+            return cls(host=found[1], port=int(found[2] or PORT))
         known = "usb, usb:1209:0001, usb:1209:0001:SERIAL or HOST:PORT"
         raise ValueError(f"{text!r} is not an address of a head; examples: {known}")
 

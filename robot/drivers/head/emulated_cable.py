@@ -61,7 +61,7 @@ class UsbConnection:
         try:
             self._socket = socket.create_connection((host, port), PATIENCE)
         except OSError:
-            raise _no_device() from None
+            raise usb_error(errno.ENODEV) from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def call(
@@ -92,9 +92,9 @@ class UsbConnection:
                 got = self._exactly(length)
             except OSError:
                 self._socket.close()  # a late answer would be read as that of the next request
-                raise _no_device() from None
+                raise usb_error(errno.ENODEV) from None
         if status:
-            raise OSError(-status, os.strerror(-status))
+            raise usb_error(-status)
         return got
 
     def close(self) -> None:
@@ -108,15 +108,15 @@ class UsbConnection:
         while size:
             part = self._socket.recv(size)
             if not part:
-                raise _no_device()
+                raise usb_error(errno.ENODEV)
             parts.append(part)
             size -= len(part)
         return b"".join(parts)
 
 
-def _no_device() -> OSError:
-    """The error of a transfer to a disconnected device."""
-    return OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+def usb_error(number: int) -> OSError:
+    """The error of a transfer, by its errno."""
+    return OSError(number, os.strerror(number))
 
 
 T = TypeVar("T")
@@ -166,7 +166,7 @@ class SocketBackend:
             "idVendor idProduct bcdDevice iManufacturer iProduct iSerialNumber bNumConfigurations"
         )
         whereabouts = {"bus": 1, "address": 1, "port_number": 1, "port_numbers": (1,), "speed": 3}
-        return SimpleNamespace(**_fields("<BBHBBBBHHHBBBB", names, dev), **whereabouts)
+        return _descriptor("<BBHBBBBHHHBBBB", names, dev, **whereabouts)
 
     def get_configuration_descriptor(self, dev: bytes, config: int) -> SimpleNamespace:
         _require_first(config)
@@ -174,7 +174,7 @@ class SocketBackend:
             "bLength bDescriptorType wTotalLength bNumInterfaces bConfigurationValue iConfiguration "
             "bmAttributes bMaxPower"
         )
-        return SimpleNamespace(**_fields("<BBHBBBBB", names, _descriptors(dev, 2)[0]), extra_descriptors=[])
+        return _descriptor("<BBHBBBBB", names, _descriptors(dev, 2)[0])
 
     def get_interface_descriptor(self, dev: bytes, intf: int, alt: int, config: int) -> SimpleNamespace:
         _require_first(intf, alt, config)
@@ -182,19 +182,14 @@ class SocketBackend:
             "bLength bDescriptorType bInterfaceNumber bAlternateSetting bNumEndpoints bInterfaceClass "
             "bInterfaceSubClass bInterfaceProtocol iInterface"
         )
-        return SimpleNamespace(**_fields("<9B", names, _descriptors(dev, 4)[0]), extra_descriptors=[])
+        return _descriptor("<9B", names, _descriptors(dev, 4)[0])
 
     def get_endpoint_descriptor(
         self, dev: bytes, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
         _require_first(intf, alt, config)
         names = "bLength bDescriptorType bEndpointAddress bmAttributes wMaxPacketSize bInterval"
-        return SimpleNamespace(
-            **_fields("<BBBBHB", names, _descriptors(dev, 5)[ep]),
-            bRefresh=0,
-            bSynchAddress=0,
-            extra_descriptors=[],
-        )
+        return _descriptor("<BBBBHB", names, _descriptors(dev, 5)[ep], bRefresh=0, bSynchAddress=0)
 
     def open_device(self, dev: bytes) -> _Handle:
         return _as_usb_error(lambda: _Handle(self.host, self.port))
@@ -289,8 +284,10 @@ def _descriptors(dev: bytes, kind: int) -> list[bytes]:
     return found
 
 
-def _fields(layout: str, names: str, descriptor: bytes) -> dict[str, int]:
-    return dict(zip(names.split(), struct.unpack_from(layout, descriptor), strict=True))
+def _descriptor(layout: str, names: str, data: bytes, **more: Any) -> SimpleNamespace:
+    """A descriptor as pyusb reads it: its fields by name."""
+    fields = dict(zip(names.split(), struct.unpack_from(layout, data), strict=True))
+    return SimpleNamespace(**fields, **more, extra_descriptors=[])
 
 
 def _require_first(*index: int) -> None:

@@ -14,7 +14,7 @@ from enum import Enum
 
 import numpy as np
 
-from robot.drivers.head.decoder import Decoder, FrameDecoder, Frames
+from robot.drivers.head.decoder import Decoder, Frames
 from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled
 from robot.drivers.head.driver_config import HeadLinkConfig
 from robot.drivers.head.usb_protocol import (
@@ -77,12 +77,12 @@ class HeadReader:
         whiskers: int,
         config: HeadLinkConfig = DEFAULT,
         *,
-        decoder: FrameDecoder | None = None,
+        decoder: Decoder | None = None,
         alive: np.ndarray | None = None,
         on_overload: Callable[[int], None] = lambda whisker: None,
     ) -> None:
         self.config = config
-        self.decoder: FrameDecoder = Decoder(whiskers) if decoder is None else decoder
+        self.decoder = Decoder(whiskers) if decoder is None else decoder
         self.ring = RingBuffer(whiskers)
         self.listeners: list[Callable[[Frames, float], None]] = []
         self.on_restart: list[Callable[[int, float], None]] = []
@@ -333,17 +333,15 @@ class RingBuffer:
     """The last samples. Any thread may read while another appends; results are copies.
 
     Args:
-        whiskers, channels: of the head. size: number of samples, a power of two.
+        whiskers: of the head. size: number of samples, a power of two.
     """
 
-    def __init__(self, whiskers: int, channels: int = CHANNELS, size: int = SIZE) -> None:
+    def __init__(self, whiskers: int, size: int = SIZE) -> None:
         if size & (size - 1):
             raise ValueError(f"size {size}: must be a power of two")
         self._size = size
-        self._sequence = np.full(size, EMPTY, np.int64)
-        self._time = np.zeros(size, np.int64)
-        self._flags = np.zeros(size, np.uint8)
-        self._values = np.zeros((size, whiskers, channels), np.int16)
+        self._frames = Frames.blank(whiskers, size)
+        self._frames.sequence[:] = EMPTY
         self._newest, self._latest, self._arrival = EMPTY, EMPTY, -np.inf
         self._lock = threading.Lock()
 
@@ -361,16 +359,14 @@ class RingBuffer:
             newest = max(self._newest, int(frames.sequence.max()))
             fresh = frames.sequence > newest - self._size
             place = frames.sequence[fresh] % self._size
-            self._sequence[place] = frames.sequence[fresh]
-            self._time[place] = frames.time[fresh]
-            self._flags[place] = frames.flags[fresh]
-            self._values[place] = frames.values[fresh]
+            for column, added in zip(self._frames, frames, strict=True):
+                column[place] = added[fresh]
             self._newest, self._arrival = newest, arrival
-            self._latest = int(self._time[newest % self._size])
+            self._latest = int(self._frames.time[newest % self._size])
 
     def between(self, first: int, last: int) -> Frames:
         """The present frames from `first` to `last`, both included, ordered by sequence number."""
         with self._lock:
             number = np.arange(max(first, self._newest - self._size + 1), min(last, self._newest) + 1)
-            place = number[self._sequence[number % self._size] == number] % self._size
-            return Frames(self._sequence[place], self._time[place], self._flags[place], self._values[place])
+            place = number[self._frames.sequence[number % self._size] == number] % self._size
+            return Frames(*(column[place] for column in self._frames))

@@ -1,8 +1,8 @@
 """Wire format of a whisker head: frames from it, commands to it, and USB control requests.
 
 All numbers are little-endian; angles are int16 counts of `ANGLE`. The USB bridges of published heads
-(BIOTACT) are not documented, so this format is not theirs; another bridge needs its own
-`robot.drivers.head.decoder.FrameDecoder`.
+(BIOTACT) are not documented, so this format is not theirs; another bridge needs its own decoder
+and its own `robot.drivers.head.device.Bridge`.
 
 Each sample of the head is one frame of 20 + 2 n c bytes (128 for 18 whiskers of 3 channels):
 
@@ -134,19 +134,17 @@ class Command(NamedTuple):
         """The command in a packet; None if it is invalid."""
         if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
             return None
-        magic, version, kind, mode, count, *rest = _COMMAND.unpack_from(packet)
-        amplitude, frequency, gain, window, offset = rest
+        magic, version, kind, mode, count, *drive = _COMMAND.unpack_from(packet)
         known = (
             magic == COMMAND_MAGIC
             and version == VERSION
             and kind in set(CommandKind)
             and mode in set(FeedbackMode)
         )
-        if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(rest).all():
+        if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(drive).all():
             return None
         numbers = np.frombuffer(packet, "<i2", count, _COMMAND.size).astype(np.int16)
-        kinds = CommandKind(kind), FeedbackMode(mode)
-        return cls(*kinds, amplitude, frequency, gain, window, offset, numbers)
+        return cls._make([CommandKind(kind), FeedbackMode(mode), *drive, numbers])
 
 
 _COMMAND = struct.Struct("<4sBBBB5f")
@@ -157,19 +155,9 @@ KEEP_ALIVE = Command(CommandKind.KEEP)
 
 def frame_dtype(whiskers: int, channels: int = CHANNELS) -> np.dtype:
     """Memory layout of a frame, without padding."""
-    return np.dtype(
-        [
-            ("magic", "<u4"),
-            ("sequence", "<u4"),
-            ("time", "<u4"),
-            ("flags", "u1"),
-            ("whiskers", "u1"),
-            ("channels", "u1"),
-            ("version", "u1"),
-            ("values", "<i2", (whiskers, channels)),
-            ("crc", "<u4"),
-        ]
-    )
+    head = [(name, "<u4") for name in ("magic", "sequence", "time")]
+    head += [(name, "u1") for name in ("flags", "whiskers", "channels", "version")]
+    return np.dtype([*head, ("values", "<i2", (whiskers, channels)), ("crc", "<u4")])
 
 
 def pack_frames(sequence: Array, time: Array, flags: Array, values: Array) -> bytes:

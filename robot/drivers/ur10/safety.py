@@ -246,12 +246,6 @@ def stale_finding(age: float, late: float, limit: float) -> Finding:
     return Finding(SessionOutcome.HOST_LATE, f"this machine was {late:.3f} s late: {detail}")
 
 
-def silent_session_finding(silent: float) -> Finding:
-    """No heartbeat of the session for `silent` s: the thread that sends it does little else."""
-    detail = f"this machine was {silent:.3f} s late: the session sent no heartbeat for so long"
-    return Finding(SessionOutcome.HOST_LATE, detail)
-
-
 def ended_script_finding(config: ArmConfig, unreset: float, late: float) -> Finding:
     """The control script has ended on the controller.
 
@@ -278,8 +272,8 @@ RATE_WINDOW = 0.25  # s of states over which the rate is measured
 class StartupRefused(InputError):
     """A startup check failed; the arm has not moved."""
 
-    def __init__(self, found: str, expected: str = "", cure: str = "", *_: str, where: str = "arm") -> None:
-        super().__init__(where, found, expected, cure)
+    def __init__(self, found: str, expected: str = "", cure: str = "") -> None:
+        super().__init__("arm", found, expected, cure)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.found, self.expected, self.cure)
@@ -347,7 +341,5 @@ def check_states(config: ArmConfig, states: Callable[[], np.ndarray]) -> None:
         time.sleep(0.05)
     here = states()[-1]["tcp"]
     if not config.box.contains(here):
-        place = ", ".join(f"{v:.3f}" for v in here[:3])
-        raise StartupRefused(
-            f"the tool stands at ({place}) m, outside the box", "", "move it into the box by hand"
-        )
+        found = f"the tool stands at {_place(here)}, outside the box"
+        raise StartupRefused(found, "", "move it into the box by hand")

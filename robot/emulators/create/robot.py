@@ -21,7 +21,7 @@ MOVES = 4096
 """Moves after which the errors of the odometry repeat."""
 
 
-class WheelState(NamedTuple):
+class _WheelState(NamedTuple):
     """Pose of the robot (m, rad), total distance (m) and total rotation (rad) of its wheels."""
 
     x: float = 0.0
@@ -30,12 +30,12 @@ class WheelState(NamedTuple):
     travelled: float = 0.0
     turned: float = 0.0
 
-    def advance(self, way: float, turn: float) -> WheelState:
+    def advance(self, way: float, turn: float) -> _WheelState:
         """The state after an arc: m, rad."""
         half = turn / 2
         chord = way * (math.sin(half) / half if half else 1.0)
         middle = self.heading + half
-        return WheelState(
+        return _WheelState(
             self.x + chord * math.cos(middle),
             self.y + chord * math.sin(middle),
             self.heading + turn,
@@ -58,7 +58,7 @@ class EmulatedCreate:
     def __init__(self, config: CreateEmulatorConfig, arena: Arena | None = None) -> None:
         self.config = config
         start = (0.0, 0.0, 0.0) if arena is None else tuple(arena.start.tolist())
-        self.base, self.mode, self._forced = WheelState(*start), Mode.OFF, Bumps(0)
+        self.base, self.mode, self._forced = _WheelState(*start), Mode.OFF, Bumps(0)
         self.walls = np.zeros((0, 4)) if arena is None else wall_segments(arena)
         self._pressed = False
         self.right = self.left = 0

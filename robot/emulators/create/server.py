@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
 import sys
 import threading
@@ -20,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from robot.drivers.create.protocol import BAUD, Bumps
-from robot.drivers.head.usb_protocol import Command
 from robot.drivers.processes import urgent
 from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig
 from robot.emulators.create.robot import EmulatedCreate
 from robot.emulators.head.emulated_device import EmulatedHead
 from robot.emulators.head.server import open_server
-from robot.emulators.head.whiskers import Block, block_samples
+from robot.emulators.head.whiskers import Block, SensorArray, block_samples
+from robot.emulators.listening import answer_fault, do_fault
 from robot.simulation.create.strain_sensors import (
     BodyVibration,
     base_strains,
@@ -155,53 +154,41 @@ class _CreateServer:
         """Advances the robot to a time, s, host's monotonic clock."""
         self.robot.advance_to(now - self.began)
 
-    def do(self, order: dict[str, Any]) -> dict[str, Any]:
-        """Executes a fault request; returns the answer.
-
-        Raises:
-            KeyError, TypeError, ValueError: invalid arguments.
-        """
+    def do(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Executes a fault request (`robot.emulators.listening.do_fault`)."""
         self.move(time.monotonic())
-        do, robot = order.get("do"), self.robot
-        if do == "bump":
-            robot.touch(robot.bumps | Bumps.BUMPED)
-        elif do == "drop":
-            robot.touch(robot.bumps | Bumps.DROPPED_LEFT)
-        elif do == "cliff":
-            robot.touch(robot.bumps, cliff=True)
-        elif do == "clear":
-            robot.touch(Bumps(0))
-            self.faults.lose = self.faults.scramble = 0
-        elif do == "off":
-            robot.switch_off()
-        elif do in ("garbage", "cut"):
-            setattr(self.faults, do, int(order["bytes"]))
-        elif do in ("lose", "scramble"):
-            setattr(self.faults, do, int(order["replies"]))
-        elif do == "trickle":
-            self.faults.trickle = float(order["seconds"])
-        elif do == "unplug":
-            if self.terminal.plugged and self._loop is not None:
-                self._loop.remove_reader(self.terminal.master)
-            self.terminal.unplug()
-        elif do == "plug":
-            if not self.terminal.plugged and self._loop is not None:
-                self.terminal.plug()
-                self._loop.add_reader(self.terminal.master, self._receive)
-        elif do == "die":
-            os._exit(1)
-        elif do == "state":
-            return self._state()
-        else:
-            return {"error": f"unknown: {do!r}"}
-        return {"ok": True}
+        robot, faults = self.robot, self.faults
+        known: dict[str, Callable[..., object]] = {
+            "bump": lambda: robot.touch(robot.bumps | Bumps.BUMPED),
+            "drop": lambda: robot.touch(robot.bumps | Bumps.DROPPED_LEFT),
+            "cliff": lambda: robot.touch(robot.bumps, cliff=True),
+            "clear": self._clear,
+            "off": robot.switch_off,
+            "garbage": lambda bytes: setattr(faults, "garbage", int(bytes)),
+            "cut": lambda bytes: setattr(faults, "cut", int(bytes)),
+            "lose": lambda replies: setattr(faults, "lose", int(replies)),
+            "scramble": lambda replies: setattr(faults, "scramble", int(replies)),
+            "trickle": lambda seconds: setattr(faults, "trickle", float(seconds)),
+            "unplug": self._unplug,
+            "plug": self._plug,
+            "state": self._state,
+            "die": lambda: os._exit(1),
+        }
+        return do_fault(known, request)
 
-    def answer(self, line: str | bytes) -> dict[str, Any]:
-        """The answer to a line of JSON, or the error in it."""
-        try:
-            return self.do(json.loads(line))
-        except (ValueError, KeyError, AttributeError, TypeError) as error:
-            return {"error": repr(error)}
+    def _clear(self) -> None:
+        self.robot.touch(Bumps(0))
+        self.faults.lose = self.faults.scramble = 0
+
+    def _unplug(self) -> None:
+        if self.terminal.plugged and self._loop is not None:
+            self._loop.remove_reader(self.terminal.master)
+        self.terminal.unplug()
+
+    def _plug(self) -> None:
+        if not self.terminal.plugged and self._loop is not None:
+            self.terminal.plug()
+            self._loop.add_reader(self.terminal.master, self._receive)
 
     def _state(self) -> dict[str, Any]:
         robot = self.robot
@@ -274,6 +261,7 @@ async def _run(config: CreateEmulatorConfig, server: _CreateServer) -> None:
             def do(request: dict[str, Any], now: float) -> dict[str, Any]:
                 if request.get("device") != "create":
                     return bridge.do(request, now)
+                del request["device"]
                 return server.do(request)
 
             head = await stack.enter_async_context(open_server(config.world.bridge, bridge, do))
@@ -292,7 +280,7 @@ def _read_requests(server: _CreateServer) -> None:
     loop = asyncio.get_running_loop()
 
     def answer(line: str) -> None:
-        print(json.dumps(server.answer(line)), flush=True)
+        print(answer_fault(line, server.do).decode(), end="", flush=True)
 
     def read() -> None:
         for line in sys.stdin:
@@ -303,7 +291,7 @@ def _read_requests(server: _CreateServer) -> None:
     threading.Thread(target=read, daemon=True, name="requests").start()
 
 
-class CreateWhiskers:
+class CreateWhiskers(SensorArray):
     """The whiskers of a Create as a `SensorArray`: angles are 0, deflections the two strains.
 
     Args:
@@ -321,20 +309,10 @@ class CreateWhiskers:
         self._fan = fixed_whiskers(config.whiskers)
         self._samples = block_samples(config.whiskers.rate)
         self._shaking = BodyVibration(config.whiskers.shake, config.whiskers.rate, random)
+        self.count = len(self._fan.base)
         self._side = np.zeros(self.count, int)
         self._pose = robot.pose
         self._changes = 0
-
-    @property
-    def count(self) -> int:
-        return len(self._fan.base)
-
-    @property
-    def resting(self) -> bool:
-        return True
-
-    def begin(self, time: float) -> None:
-        """The robot moves by its own commands."""
 
     def block(self, start: float, end: float) -> Block:
         self._move(end)
@@ -347,7 +325,10 @@ class CreateWhiskers:
         self._side = bent.side[-1]
         changed, self._changes = self._changes != len(self._robot.speeds), len(self._robot.speeds)
         rolls = bool(self._robot.right or self._robot.left)
-        shake = self._shaking.advance(self._samples, rolls=rolls, starts=changed and rolls)
+        if changed and rolls:
+            self._shaking.start()
+        rumble = self._shaking.rumble(self._samples, rolls)
+        shake = self._shaking.ring(self._samples) + rumble
         strain = base_strains(self.config.whiskers, self._fan, bent) + shake[:, None]
         strain += self.config.whiskers.noise * self._random.standard_normal(strain.shape)
         strain = np.where(self._fan.alive[:, None], strain, 0.0)
@@ -358,12 +339,6 @@ class CreateWhiskers:
 
     def skip_block(self) -> None:
         self._pose = self._robot.pose
-
-    def receive(self, command: Command, now: float) -> None:
-        """Fixed whiskers have no drives."""
-
-    def stop(self) -> None:
-        """Fixed whiskers have no drives."""
 
     def state(self, now: float) -> dict[str, Any]:
         return {"pose": self._robot.pose.tolist(), "side": self._side.tolist()}

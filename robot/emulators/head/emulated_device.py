@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from robot.drivers.head.emulated_cable import usb_error
 from robot.drivers.head.usb_protocol import (
     CHANNELS,
     ENDPOINT_IN,
@@ -33,6 +34,7 @@ from robot.drivers.head.usb_protocol import (
 )
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig
 from robot.emulators.head.whiskers import Block, SensorArray, block_samples
+from robot.emulators.listening import do_fault
 from tactile.base.random_streams import stream
 
 STRINGS = ("", "ratslam", "emulated whisker head", "EMULATED")
@@ -134,25 +136,17 @@ class EmulatedHead:
         elif kind & 0x60 == REQUEST_IN & 0x60 and request in set(Request):
             answer = self._vendor(Request(request), now)
         if answer is None:
-            raise OSError(errno.EPIPE, os.strerror(errno.EPIPE))
+            raise usb_error(errno.EPIPE)
         return answer[:size]
 
     def do(self, request: dict[str, Any], now: float) -> dict[str, Any]:
-        """Starts a fault, or returns counts or state: {"do": name, ...}.
-
-        Raises:
-            ValueError, TypeError: unknown fault or invalid arguments.
-        """
-        arguments = dict(request)
-        name = str(arguments.pop("do", ""))
-        if name == "counts":
-            return self.counts()
-        if name == "state":
-            return self.state(now)
-        self.faults.do(name, now, arguments)
-        if name == "unplug":
+        """Starts a fault, or returns counts or state (`robot.emulators.listening.do_fault`)."""
+        self.faults.now = now
+        known = self.faults.known | {"counts": self.counts, "state": lambda: self.state(now)}
+        answer = do_fault(known, request)
+        if request.get("do") == "unplug":
             self.halt()
-        return {"ok": True}
+        return answer
 
     def halt(self) -> None:
         """Retracts the whiskers, stops making frames and drops unread ones."""
@@ -242,33 +236,24 @@ class _HeadFaults:
         self.plugged, self.plugs = True, 1
         self.skipped, self.jump = 0, 0
         self._whiskers, self._random = whiskers, random
-        self._skip = self._corrupt = self._garbage = self._swap = 0
+        self._pending: Counter[str] = Counter()  # bytes of garbage; frames to corrupt, skip and swap
         self._saturated: dict[int, float] = {}
         self._halted, self._halted_until, self._silent_until = False, -np.inf, -np.inf
-        self.known: dict[str, Callable[..., None]] = {
-            "unplug": self.unplug,
-            "plug": self.plug,
-            "stall": self.stall,
-            "silence": self.silence,
-            "garbage": lambda now, bytes=64: self._count("_garbage", bytes),
-            "corrupt": lambda now, frames=1: self._count("_corrupt", frames),
-            "skip": lambda now, frames=1: self._count("_skip", frames),
-            "swap": lambda now, frames=1: self._count("_swap", frames),
-            "clock": self.jump_clock,
-            "saturate": self.saturate,
-            "die": lambda now: os._exit(1),
+        self.now = 0.0  # of a request
+        self.known: dict[str, Callable[..., Any]] = {
+            "unplug": lambda: setattr(self, "plugged", False),
+            "plug": self._plug,
+            "stall": self._stall,
+            "silence": lambda seconds=1.0: setattr(self, "_silent_until", self.now + float(seconds)),
+            "garbage": lambda bytes=64: self._pending.update(garbage=int(bytes)),
+            "corrupt": lambda frames=1: self._pending.update(corrupt=int(frames)),
+            "skip": lambda frames=1: self._pending.update(skip=int(frames)),
+            "swap": lambda frames=1: self._pending.update(swap=int(frames)),
+            "clock": lambda jump_us: setattr(self, "jump", self.jump + int(jump_us)),
+            "saturate": self._saturate,
+            "die": lambda: os._exit(1),
         }
-        """Faults by name; each takes the time and its arguments."""
-
-    def do(self, name: str, now: float, arguments: dict[str, Any]) -> None:
-        """Starts a fault.
-
-        Raises:
-            ValueError, TypeError: unknown fault or invalid arguments.
-        """
-        if name not in self.known:
-            raise ValueError(f"{name!r}; known are {', '.join(self.known)}, counts, state")
-        self.known[name](now, **arguments)
+        """Faults by name; each takes its arguments."""
 
     def check_in(self, now: float) -> bool:
         """Whether the frame endpoint returns data.
@@ -278,7 +263,7 @@ class _HeadFaults:
         """
         if self._halted or now < self._halted_until:
             self._halted = True
-            raise OSError(errno.EPIPE, os.strerror(errno.EPIPE))
+            raise usb_error(errno.EPIPE)
         return now >= self._silent_until
 
     def clear_halt(self) -> None:
@@ -296,48 +281,35 @@ class _HeadFaults:
 
     def count_unskipped(self, count: int) -> int:
         """Number of frames to send of the next `count`; the first ones are skipped."""
-        out = min(self._skip, count)
-        self._skip -= out
+        out = min(self._pending["skip"], count)
+        self._pending["skip"] -= out
         self.skipped += out
         return count - out
 
     def damage_frames(self, frames: list[bytes]) -> list[bytes]:
         """The frames after pending faults (corrupt, garbage, swap); their number is unchanged."""
-        for k in range(min(self._corrupt, len(frames))):
+        for k in range(min(self._pending["corrupt"], len(frames))):
             place = HEADER + int(self._random.integers(len(frames[k]) - HEADER))
             frames[k] = frames[k][:place] + bytes([frames[k][place] ^ 0x55]) + frames[k][place + 1 :]
-            self._corrupt -= 1
-        if self._garbage and frames:
-            frames[0] = self._random.bytes(self._garbage) + frames[0]
-            self._garbage = 0
-        if self._swap and len(frames) > 1:
+            self._pending["corrupt"] -= 1
+        if self._pending["garbage"] and frames:
+            frames[0] = self._random.bytes(self._pending.pop("garbage")) + frames[0]
+        if self._pending["swap"] and len(frames) > 1:
             frames[-2:] = frames[:-3:-1]
-            self._swap -= 1
+            self._pending["swap"] -= 1
         return frames
 
-    def _count(self, name: str, more: int) -> None:
-        setattr(self, name, getattr(self, name) + int(more))
-
-    def unplug(self, now: float) -> None:
-        self.plugged = False
-
-    def plug(self, now: float) -> None:
+    def _plug(self) -> None:
         self.plugs += not self.plugged
         self.plugged, self._halted, self._halted_until = True, False, -np.inf
 
-    def stall(self, now: float, seconds: float = 0.0) -> None:
-        self._halted, self._halted_until = True, now + float(seconds)
+    def _stall(self, seconds: float = 0.0) -> None:
+        self._halted, self._halted_until = True, self.now + float(seconds)
 
-    def silence(self, now: float, seconds: float = 1.0) -> None:
-        self._silent_until = now + float(seconds)
-
-    def jump_clock(self, now: float, jump_us: int) -> None:
-        self.jump += int(jump_us)
-
-    def saturate(self, now: float, whisker: int = 0, seconds: float = 1.0) -> None:
+    def _saturate(self, whisker: int = 0, seconds: float = 1.0) -> None:
         if not 0 <= whisker < self._whiskers:
             raise ValueError(f"whisker {whisker}; the head has 0 to {self._whiskers - 1}")
-        self._saturated[whisker] = now + float(seconds)
+        self._saturated[whisker] = self.now + float(seconds)
 
 
 class Fifo:
@@ -360,14 +332,9 @@ class Fifo:
         """Number of frames in the queue."""
         return len(self._frames) + bool(self._begun)
 
-    @property
-    def room(self) -> int:
-        """Number of frames that still fit."""
-        return self.capacity - len(self)
-
     def push(self, frames: Sequence[bytes]) -> None:
         """Adds the first frames that fit."""
-        fits = frames[: self.room]
+        fits = frames[: self.capacity - len(self)]
         self._frames.extend(fits)
         self.made += len(frames)
         self.lost += len(frames) - len(fits)

@@ -9,20 +9,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import json
-import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
-from robot.drivers.head.emulated_cable import ANSWER, IN, REQUEST, Op
+from robot.drivers.head.emulated_cable import ANSWER, IN, REQUEST, Op, usb_error
 from robot.drivers.head.usb_protocol import ENDPOINT_IN
 from robot.drivers.processes import urgent
 from robot.drivers.ur10.rtde_protocol import PoseListener
 from robot.emulators.head.emulated_device import DESCRIPTORS, EmulatedHead
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
-from robot.emulators.head.whiskers import AlongPath, CarriedByArm, PoseSource, maze_whiskers
-from robot.emulators.listening import listening
+from robot.emulators.head.whiskers import AlongPath, CarriedByArm, PoseSource, Whiskers
+from robot.emulators.listening import answer_fault, listening
 from robot.world.scene import HeadPath, KidnapConfig, make_scene
 from tactile.whisker_geometry import ur10_head
 
@@ -49,7 +47,7 @@ def serve(config: HeadEmulatorConfig) -> None:
             arm = PoseListener(config.arm, hz=config.arm_hz)
             stack.callback(arm.close)
             place = CarriedByArm(arm, config.placing)
-        whiskers = maze_whiskers(config, made.surroundings.walls, place)
+        whiskers = Whiskers(config, made.surroundings.walls, place)
         stack.enter_context(urgent())  # not before: building takes a core
         asyncio.run(_run_server(config, EmulatedHead(config, whiskers, time.monotonic())))
 
@@ -131,12 +129,8 @@ class _HeadServer:
     async def faults(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Executes fault requests: one JSON line each, answered by one JSON line."""
         while line := await reader.readline():
-            try:
-                answer = self._do(dict(json.loads(line)), time.monotonic())
-            except (TypeError, ValueError) as error:
-                answer = {"ok": False, "error": str(error)}
+            writer.write(answer_fault(line, lambda request: self._do(request, time.monotonic())))
             self._notify()
-            writer.write(json.dumps(answer).encode() + b"\n")
             await writer.drain()
 
     async def _answer(self, header: tuple[int, ...], data: bytes, plugs: int, connection: object) -> bytes:
@@ -147,7 +141,7 @@ class _HeadServer:
             return DESCRIPTORS
         if op == Op.CLAIM:
             if self._owner is not None and self._owner[0] is not connection and self._owner[1] == plugs:
-                raise _error(errno.EBUSY)
+                raise usb_error(errno.EBUSY)
             self._owner = connection, plugs
         elif op == Op.RELEASE:
             self._release(connection)
@@ -163,7 +157,7 @@ class _HeadServer:
         elif op == Op.RESET:
             bridge.halt()
         else:
-            raise _error(errno.EINVAL)
+            raise usb_error(errno.EINVAL)
         return b""
 
     async def _frames(self, size: int, timeout: int, plugs: int) -> bytes:
@@ -179,14 +173,14 @@ class _HeadServer:
             if got := self.bridge.bulk_in(size, now):
                 return got
             if now >= end:
-                raise _error(errno.ETIMEDOUT)
+                raise usb_error(errno.ETIMEDOUT)
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._changed.wait(), min(end - now, 1.0))
 
     def _present(self, plugs: int) -> None:
         faults = self.bridge.faults
         if not faults.plugged or plugs != faults.plugs:
-            raise _error(errno.ENODEV)
+            raise usb_error(errno.ENODEV)
 
     def _release(self, connection: object) -> None:
         if self._owner is not None and self._owner[0] is connection:
@@ -196,7 +190,3 @@ class _HeadServer:
         """Wakes connections that wait for frames."""
         self._changed.set()
         self._changed.clear()
-
-
-def _error(number: int) -> OSError:
-    return OSError(number, os.strerror(number))

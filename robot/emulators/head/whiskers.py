@@ -6,7 +6,7 @@ or at the end of the previous whisk. The head stands, moves along a path or is c
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -22,20 +22,18 @@ from robot.drivers.head.usb_protocol import (
 from robot.drivers.ur10.driver_config import BaseTransformConfig
 from robot.drivers.ur10.rtde_protocol import PoseListener
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
-from robot.simulation.head.baseline import Baseline, make_baseline
-from robot.simulation.head.beam import StreamConfig
-from robot.simulation.head.kinematic import MechanicsConfig
+from robot.simulation.head.baseline import make_baseline
 from robot.simulation.head.whisk_stream import (
-    WallSweep,
     WhiskerBalance,
     advance_balance,
     draw_noise,
     sensor_readings,
+    sweep_air,
     sweep_walls,
     whiskers_at_rest,
 )
 from robot.world.scene import HeadPath, poses_at
-from robot.world.walls import NO_CONTACT, Surroundings, Walls
+from robot.world.walls import Surroundings, Walls
 from tactile.base.random_streams import stream
 from tactile.whisker_geometry import Head, ur10_head
 from tactile.whisking import WhiskDrive, WhiskingConfig, whisk_command, whisk_phase
@@ -63,81 +61,63 @@ class Block(NamedTuple):
     fed_back: bool
 
 
-class SensorArray(Protocol):
-    """Simulated whiskers, moved by drives or fixed. Times are the host's monotonic clock, s."""
+class SensorArray:
+    """Simulated whiskers; fixed ones have no drives. Times are the host's monotonic clock, s."""
 
-    @property
-    def count(self) -> int:
-        """Number of whiskers."""
-        ...
+    count: int
+    """Number of whiskers."""
 
     @property
     def resting(self) -> bool:
         """Whether all drives rest, so that blocks nobody reads need not be made."""
-        ...
+        return True
 
     def begin(self, time: float) -> None:
         """The stream of samples starts."""
-        ...
 
     def block(self, start: float, end: float) -> Block:
         """The samples between two times."""
-        ...
+        raise NotImplementedError
 
     def skip_block(self) -> None:
         """Skips a block without samples or motion."""
-        ...
 
     def receive(self, command: Command, now: float) -> None:
         """Executes a command."""
-        ...
 
     def stop(self) -> None:
         """Retracts the whiskers and stops the drives."""
-        ...
 
     def state(self, now: float) -> dict[str, Any]:
         """Pose and activity, as JSON values."""
-        ...
+        raise NotImplementedError
 
 
 STEP = 1e-4
 """Resolution of lifts, m; an arm at working height stays within it."""
 
 
-class Whiskers:
-    """The whiskers with their state between blocks, and the walls.
+class Whiskers(SensorArray):
+    """The whiskers of an emulated head with their state between blocks, among the walls of its maze.
 
     Attributes:
         drives: the drives, which receive commands. pose, lift: of the head at the end of the last block.
     """
 
-    def __init__(
-        self,
-        config: StreamConfig,
-        mechanics: MechanicsConfig,
-        head: Head,
-        walls: Walls,
-        place: PoseSource,
-        random: np.random.Generator,
-        samples: int,
-        baseline: Baseline | None = None,
-    ) -> None:
-        self.config, self.mechanics, self.head = config, mechanics, head
-        self.baseline = baseline
-        self.walls, self.place, self.random, self.samples = walls, place, random, samples
-        self.drives = _ServoDrives(head, config.rate)
-        self.balance = whiskers_at_rest(1, len(head.length))
+    def __init__(self, config: HeadEmulatorConfig, walls: Walls, place: PoseSource) -> None:
+        rate, mechanics, head = config.stream.rate, config.mechanics, ur10_head(config.head)
+        self.config, self.mechanics, self.head = config.stream, mechanics, head
+        self.walls, self.place, self.random = walls, place, stream(config.seed, "sensor")
+        self.count, self.samples = len(head.length), block_samples(rate)
+        self.baseline = make_baseline(mechanics.baseline, mechanics.noise, rate, self.count, config.seed)
+        self.drives = _ServoDrives(head, rate)
+        self.balance = whiskers_at_rest(1, self.count)
         self.pose: np.ndarray | None = None
         self.lift = np.inf
         self._around: Surroundings | None = None
         self._lowered = np.inf
         # Above this lift no tip reaches the tallest wall.
         self._clear = float(walls.height.max() + (head.length - head.base[:, 2]).max())
-
-    @property
-    def count(self) -> int:
-        return len(self.head.length)
 
     @property
     def resting(self) -> bool:
@@ -154,7 +134,6 @@ class Whiskers:
         self.drives.stop()
 
     def state(self, now: float) -> dict[str, Any]:
-        """Pose and activity, as JSON values."""
         whisk = self.drives.whisk
         pose, lift = self.place.at(now)
         doing = {} if whisk is None else whisk.whisking.model_dump() | {"amplitude": whisk.amplitude.tolist()}
@@ -167,11 +146,9 @@ class Whiskers:
         }
 
     def skip_block(self) -> None:
-        """Skips a block without samples or motion."""
         self.pose = None
 
     def block(self, start: float, end: float) -> Block:
-        """The samples between two times, s, host's monotonic clock."""
         rate, size = self.config.rate, self.samples
         if self.pose is None:
             self.pose, self.lift = self.place.at(start)
@@ -198,8 +175,7 @@ class Whiskers:
                     self._around, self._lowered = Surroundings(lower, self.head), lift
                 sweep = sweep_walls(self._around, pose, knots, time, some)
             else:
-                nothing = np.zeros((len(time), 1, len(self.head.length)))
-                sweep = WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, some)
+                sweep = sweep_air(time, some)
             truth, self.balance = advance_balance(
                 self.config, self.mechanics, self.drives.law, sweep, self.balance
             )
@@ -208,21 +184,6 @@ class Whiskers:
             done += count
         angle, deflection = (np.concatenate([part[k][0] for part in parts]) for k in range(2))
         return Block(angle, deflection, begins, bool((self.balance.drive.most > 0).any()))
-
-
-def maze_whiskers(config: HeadEmulatorConfig, walls: Walls, place: PoseSource) -> Whiskers:
-    """The whiskers of an emulated head among the walls of its maze."""
-    rate, mechanics, head = config.stream.rate, config.mechanics, ur10_head(config.head)
-    return Whiskers(
-        config.stream,
-        mechanics,
-        head,
-        walls,
-        place,
-        stream(config.seed, "sensor"),
-        block_samples(rate),
-        make_baseline(mechanics.baseline, mechanics.noise, rate, len(head.length), config.seed),
-    )
 
 
 RETRACTION = 0.2
@@ -254,7 +215,7 @@ class _ServoDrives:
     """
 
     def __init__(self, head: Head, rate: float) -> None:
-        self.head, self.rate = head, rate
+        self.head, self.rate, self._retraction = head, rate, round(RETRACTION * rate)
         self.whisk: _Whisk | None = None
         self.sample = 0
         self._next: _Whisk | None = None
@@ -273,10 +234,6 @@ class _ServoDrives:
         if self.whisk is not None:
             return self.whisk.samples - self.sample
         return None if self._from is None else self._retraction - self.sample
-
-    @property
-    def _retraction(self) -> int:
-        return round(RETRACTION * self.rate)
 
     def receive(self, command: Command, time: float) -> None:
         """Stores a command received at a time, s (the clock of `begin`)."""
@@ -368,18 +325,6 @@ AHEAD = 0.1
 """Longest extrapolation of a pose by the arm's speed, s; after that the head stands still."""
 
 
-class PoseSource(Protocol):
-    """Pose of the head over time."""
-
-    def at(self, time: float) -> tuple[np.ndarray, float]:
-        """Pose in the map [3] (m, m, rad) and lift above working height, m.
-
-        Args:
-            time: s, host's monotonic clock.
-        """
-        ...
-
-
 class CarriedByArm:
     """The newest pose of an arm, extrapolated by its speed."""
 
@@ -412,3 +357,8 @@ class AlongPath:
     def at(self, time: float) -> tuple[np.ndarray, float]:
         since = 0.0 if self.began is None else time - self.began
         return poses_at(self.path, np.array(since)), 0.0
+
+
+PoseSource = CarriedByArm | AlongPath
+"""The pose of the head in the map [3] (m, m, rad) and its lift above working height, m, at a time, s, of the
+host's monotonic clock."""

@@ -23,7 +23,7 @@ from robot.emulators.ur10.emulated_arm import (
     parse_moves,
 )
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
-from robot.emulators.ur10.kinematics import Vector6
+from robot.emulators.ur10.kinematics import Vector6, vector6
 
 MAX_TARGETS = 10_000  # orders kept for the fault request "state"
 
@@ -70,11 +70,6 @@ class Registers:
             self.doubles[int(index)] = value[0]
         else:
             self.inputs[name] = value
-
-    def vector(self, first: int) -> tuple[float, float, float, float, float, float]:
-        """Six consecutive input doubles."""
-        a, b, c, d, e, f = self.doubles[first : first + 6]
-        return a, b, c, d, e, f
 
     def put_int(self, index: int, value: int) -> None:
         self.fields[f"output_int_register_{index}"] = (value,)
@@ -244,7 +239,7 @@ class EmulatedController:
         """Joints [6] (rad) for a tool pose [6] (m, rotation vector rad). Raises `Unreachable`."""
         if self.ik_fails:
             raise Unreachable("requested failure")
-        return self.arm.model.backward(tcp, self.arm.state.joints)
+        return self.arm.solve(tcp)
 
     def solvable(self, tcp: Vector6) -> bool:
         try:
@@ -376,7 +371,7 @@ class _ControlProgram:
 
     def _execute(self, command: int) -> None:
         controller, first = self._controller, self._registers.doubles[self._offset]
-        vector = self._registers.vector(self._offset)
+        vector = vector6(self._registers.doubles[self._offset : self._offset + 6])
         if command == _ControlCommand.MOVE_L:
             controller.solve(vector)
             speed, acceleration = self._registers.doubles[self._offset + 6 : self._offset + 8]

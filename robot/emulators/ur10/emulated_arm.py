@@ -1,7 +1,7 @@
 """The emulated arm: straight moves and stops as motions in control steps, and walls that push its tool.
 
-A motion is a value: its `advance` gives the arm's state after a time step and the rest of the motion. Moves
-are also read from URScript text.
+A motion is a value: its `advance` gives the tool's pose and speed after a time step, and the rest of the
+motion. Moves are also read from URScript text.
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ import contextlib
 import math
 import re
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
 from robot.emulators.ur10.kinematics import (
     UR10,
     UR10E,
-    Geometry,
     Vector6,
     compose_poses,
     invert_pose,
     rotate_by,
     rotation_between,
+    vector6,
 )
 
 ZERO: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -46,32 +46,6 @@ class _MotionState(NamedTuple):
     speed: Vector6
     joints: Vector6
     joint_speed: Vector6
-
-
-class _ArmModel(NamedTuple):
-    """The arm's lengths, and the tool's pose in the flange with its inverse."""
-
-    geometry: Geometry
-    tool: Vector6 = ZERO
-    tool_back: Vector6 = ZERO
-
-    def with_tool(self, tool: Vector6) -> _ArmModel:
-        return _ArmModel(self.geometry, tool, invert_pose(tool))
-
-    def forward(self, joints: Sequence[float]) -> Vector6:
-        return compose_poses(self.geometry.forward(joints), self.tool)
-
-    def backward(self, tcp: Sequence[float], near: Sequence[float]) -> Vector6:
-        joints = self.geometry.backward(compose_poses(tcp, self.tool_back), near)
-        if joints is None:
-            raise Unreachable(f"no joints for {[round(number, 4) for number in tcp]}")
-        return joints
-
-    def move_tool(self, state: _MotionState, tcp: Vector6, speed: Vector6, dt: float) -> _MotionState:
-        """The arm's state `dt` s later, with the tool at `tcp`. Raises `Unreachable`."""
-        joints = self.backward(tcp, state.joints)
-        turned = [after - before for after, before in zip(joints, state.joints, strict=True)]
-        return _MotionState(tcp, speed, joints, _scale(turned, 1 / dt))
 
 
 class Profile(NamedTuple):
@@ -114,23 +88,19 @@ class _LinearMotion(NamedTuple):
     profile: Profile
     time: float = 0.0
 
-    def advance(
-        self, model: _ArmModel, state: _MotionState, dt: float
-    ) -> tuple[_MotionState, _LinearMotion | None]:
+    def advance(self, dt: float) -> tuple[Vector6, Vector6, _LinearMotion | None]:
         time = self.time + dt
         done, rate = self.profile.at(time)
         length = self.profile.length or 1.0
         x, y, z, rx, ry, rz = (done / length * number for number in self.way)
         start = self.start
         tcp = (start[0] + x, start[1] + y, start[2] + z, *rotate_by(start, (rx, ry, rz)))
-        speed = _scale(self.way, rate / length)
-        after = model.move_tool(state, tcp, speed, dt)
-        return after, None if time >= self.profile.duration else self._replace(time=time)
+        rest = None if time >= self.profile.duration else self._replace(time=time)
+        return tcp, _scale(self.way, rate / length), rest
 
 
-def _scale(vector: Sequence[float], scale: float) -> Vector6:
-    a, b, c, d, e, f = (x * scale for x in vector)
-    return a, b, c, d, e, f
+def _scale(vector: Iterable[float], scale: float) -> Vector6:
+    return vector6(x * scale for x in vector)
 
 
 class MoveL(NamedTuple):
@@ -147,23 +117,22 @@ class StopL(NamedTuple):
     acceleration: float
 
     def advance(
-        self, model: _ArmModel, state: _MotionState, dt: float, turn_ratio: float
-    ) -> tuple[_MotionState, StopL | None]:
+        self, state: _MotionState, dt: float, turn_ratio: float
+    ) -> tuple[Vector6, Vector6, StopL | None]:
         """Slows translation and rotation down; `turn_ratio` (rad/m) relates their decelerations."""
         slowed: list[float] = []
         step = self.acceleration * dt
         for now, most in ((state.speed[:3], step), (state.speed[3:], step * turn_ratio)):
             length = math.hypot(*now)
             slowed += [0.0 if length <= most else v - v * most / length for v in now]
-        x, y, z, rx, ry, rz = slowed
+        x, y, z, rx, ry, rz = speed = vector6(slowed)
         tcp = (
             state.tcp[0] + x * dt,
             state.tcp[1] + y * dt,
             state.tcp[2] + z * dt,
             *rotate_by(state.tcp, (rx * dt, ry * dt, rz * dt)),
         )
-        speed = (x, y, z, rx, ry, rz)
-        return model.move_tool(state, tcp, speed, dt), self if any(speed) else None
+        return tcp, speed, self if any(speed) else None
 
 
 MoveOrder = MoveL | StopL
@@ -178,11 +147,11 @@ def parse_moves(text: str) -> list[MoveL]:
     moves = []
     for match in filter(None, map(_MOVE.match, text.splitlines())):
         with contextlib.suppress(ValueError):  # not numbers: the line is ignored
-            x, y, z, rx, ry, rz = map(float, match["pose"].split(","))
+            goal = vector6(map(float, match["pose"].split(",")))
             limits = {"a": 1.2, "v": 0.25} | {
                 name: float(value) for name, value in _LIMIT.findall(match["limits"])
             }
-            moves.append(MoveL((x, y, z, rx, ry, rz), limits["v"], limits["a"]))
+            moves.append(MoveL(goal, limits["v"], limits["a"]))
     return moves
 
 
@@ -195,7 +164,8 @@ class EmulatedArm:
     """
 
     def __init__(self, config: UrEmulatorConfig) -> None:
-        self.model: _ArmModel = _ArmModel(UR10 if config.version[0] < 5 else UR10E)
+        self._geometry = UR10 if config.version[0] < 5 else UR10E
+        self._tool = self._tool_back = ZERO  # pose of the tool in the flange, and its inverse
         self.walls = list(config.walls)
         self.turn_ratio = config.turn_ratio
         self.scale = 1.0
@@ -204,9 +174,8 @@ class EmulatedArm:
         self._motion: _LinearMotion | StopL | None = None
         self._order: MoveOrder | None = None
         self._queue: deque[MoveOrder] = deque()
-        tcp = config.start
-        self.state: _MotionState = _MotionState(tcp, ZERO, self.model.backward(tcp, NEAR), ZERO)
-        self._update_force()
+        self.state = _MotionState(config.start, ZERO, NEAR, ZERO)
+        self.place(config.start)
 
     @property
     def busy(self) -> bool:
@@ -224,15 +193,22 @@ class EmulatedArm:
 
     def place(self, tcp: Vector6) -> None:
         """Sets the tool pose [6] (m, rotation vector rad) at once. Raises `Unreachable`."""
-        self.state = _MotionState(tcp, ZERO, self.model.backward(tcp, self.state.joints), ZERO)
+        self.state = _MotionState(tcp, ZERO, self.solve(tcp), ZERO)
         self._motion, self._order = None, None
         self._queue.clear()
         self._update_force()
 
     def set_tool(self, tool: Vector6) -> None:
         """Sets the tool's pose [6] in the flange frame (m, rotation vector rad); the joints stay."""
-        self.model = self.model.with_tool(tool)
-        self.state = self.state._replace(tcp=self.model.forward(self.state.joints))
+        self._tool, self._tool_back = tool, invert_pose(tool)
+        self.state = self.state._replace(tcp=compose_poses(self._geometry.forward(self.state.joints), tool))
+
+    def solve(self, tcp: Vector6) -> Vector6:
+        """Joints [6] (rad), near the present ones, for a tool pose [6]. Raises `Unreachable`."""
+        joints = self._geometry.backward(compose_poses(tcp, self._tool_back), self.state.joints)
+        if joints is None:
+            raise Unreachable(f"no joints for {[round(number, 4) for number in tcp]}")
+        return joints
 
     def order(self, orders: Iterable[MoveOrder]) -> None:
         """Replaces all orders. A move stops a moving arm first, since moves start at rest."""
@@ -271,7 +247,7 @@ class EmulatedArm:
         state, ratio, acceleration = self.state, self.turn_ratio, max(order.acceleration, SMALL)
         if isinstance(order, StopL):
             return StopL(acceleration)
-        self.model.backward(order.goal, state.joints)
+        self.solve(order.goal)
         speed = max(order.speed, SMALL)
         x, y, z = (g - s for g, s in zip(order.goal[:3], state.tcp[:3], strict=True))
         way = (x, y, z, *rotation_between(state.tcp, order.goal))
@@ -282,20 +258,21 @@ class EmulatedArm:
         return _LinearMotion(state.tcp, way, slower) if slower.length > 0 else None
 
     def _advance(self, dt: float) -> None:
-        motion = self._motion
+        motion, joints = self._motion, self.state.joints
         assert motion is not None
         scale = 1.0 if isinstance(motion, StopL) else self.scale
         if scale <= 0:
             self._rest()
             return
         if isinstance(motion, StopL):
-            state, self._motion = motion.advance(self.model, self.state, dt, self.turn_ratio)
+            tcp, speed, self._motion = motion.advance(self.state, dt, self.turn_ratio)
         else:
-            state, self._motion = motion.advance(self.model, self.state, dt * scale)
+            tcp, speed, self._motion = motion.advance(dt * scale)
+        after = self.solve(tcp)
+        rate = _scale((new - old for new, old in zip(after, joints, strict=True)), 1 / (dt * scale))
         if scale != 1.0:
-            speed, rate = _scale(state.speed, scale), _scale(state.joint_speed, scale)
-            state = state._replace(speed=speed, joint_speed=rate)
-        self.state = state
+            speed, rate = _scale(speed, scale), _scale(rate, scale)
+        self.state = _MotionState(tcp, speed, after, rate)
         if self._motion is None:
             self._order = None
             self._rest()
@@ -309,5 +286,5 @@ class EmulatedArm:
         force = [0.0, 0.0, 0.0]
         for wall, depth in zip(self.walls, depths, strict=True):
             force["xyz".index(wall.axis)] -= wall.solid * wall.stiffness * depth
-        self.force = (force[0], force[1], force[2], 0.0, 0.0, 0.0)
+        self.force = vector6([*force, 0.0, 0.0, 0.0])
         self.penetration_max = max([self.penetration_max, *depths])

@@ -7,13 +7,19 @@ Plain floats: a control step handles one pose at a time, where an array costs mo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector3, Vector3, Vector3]  # rows
+
+
+def vector6(numbers: Iterable[float]) -> Vector6:
+    """Six numbers, such as a pose or joints, as a tuple."""
+    a, b, c, d, e, f = numbers
+    return a, b, c, d, e, f
 
 
 def quaternion(vector: Sequence[float]) -> Quaternion:
@@ -211,11 +217,10 @@ class Geometry(NamedTuple):
                 best, least = way, size
         if best is None:
             return None
-        a, b, c, d, e, f = (
+        return vector6(
             n + w if abs(n + w) <= math.tau else math.remainder(n + w, math.tau)
             for n, w in zip(near, best, strict=True)
         )
-        return a, b, c, d, e, f
 
 
 UR10 = Geometry(0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922)

@@ -1,4 +1,4 @@
-"""Main loop of the emulator, control steps at absolute times with client data in between, and its sessions.
+"""Main loop of the emulator, control steps at absolute times with client data in between, sessions, faults.
 
 One thread, no locks. Late steps are made up for, up to `BACKLOG`, so that the mean rate holds on a busy
 machine; steps later than that are skipped, and the robot's clock jumps. Sources of the sessions: Universal
@@ -8,40 +8,39 @@ Robots, "Real-Time Data Exchange (RTDE) Guide" and "Dashboard Server", CB3 and e
 from __future__ import annotations
 
 import contextlib
+import math
+import os
 import selectors
 import socket
 import struct
-import sys
 import time
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any
 
 from robot.drivers.processes import urgent
 from robot.drivers.ur10 import rtde_protocol
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
-from robot.emulators.listening import listening
+from robot.emulators.listening import answer_fault, do_fault, listening
 from robot.emulators.ur10.controller import EmulatedController, RobotMode, Runtime, Value
 from robot.emulators.ur10.emulated_arm import Unreachable
-from robot.emulators.ur10.emulator_config import DASHBOARD_PORT, FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig
-from robot.emulators.ur10.fault_server import ControllerFaults, FaultSession
+from robot.emulators.ur10.emulator_config import (
+    DASHBOARD_PORT,
+    FAULT_PORT,
+    SCRIPT_PORT,
+    UrEmulatorConfig,
+    WallConfig,
+)
+from robot.emulators.ur10.kinematics import vector6
 from tactile.base.errors import InputError
 
 BACKLOG = 0.1  # s
 PENDING = 1 << 18  # unread bytes of a client above which it gets no states
 
 
-class _ClientSession(Protocol):
-    """State of one client of a port."""
-
-    def receive(self, data: bytes, host: float) -> bytes: ...
-
-    def close(self) -> None: ...
-
-
 class _Connection:
     """A socket with its session and its unsent bytes."""
 
-    def __init__(self, link: socket.socket, session: _ClientSession) -> None:
+    def __init__(self, link: socket.socket, session: RtdeSession | _LineSession) -> None:
         link.setblocking(False)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.link = link
@@ -66,15 +65,15 @@ class _ControllerServer:
     def __init__(self, config: UrEmulatorConfig) -> None:
         self.controller = EmulatedController(config)
         self.claims = Claims()
-        self.faults = ControllerFaults(self)
+        self.faults = _ControllerFaults(self)
         self.clients: list[_Connection] = []
         self._selector = selectors.SelectSelector()  # resolution 1 us; epoll has 1 ms
         self._steps = 0
-        ports: dict[int, Callable[[], _ClientSession]] = {
+        ports: dict[int, Callable[[], RtdeSession | _LineSession]] = {
             RTDE_PORT: lambda: RtdeSession(self.controller, self.claims),
             SCRIPT_PORT: lambda: ScriptSession(self.controller),
             DASHBOARD_PORT: lambda: DashboardSession(self.controller),
-            FAULT_PORT: lambda: FaultSession(self.faults),
+            FAULT_PORT: lambda: _LineSession(self.faults.answer),
         }
         for port, make_session in ports.items():
             with listening(config.host, port, config.open_to_network):
@@ -168,37 +167,50 @@ def serve(config: UrEmulatorConfig) -> None:
     except Unreachable as error:
         raise InputError("start", str(error), "a pose within 1.3 m of the base", "move it") from error
     with urgent():
-        sys.stdout.write("ready\n")
-        sys.stdout.flush()
+        print("ready", flush=True)
         server.run()
 
 
-class ScriptSession:
-    """One client. A program runs from a line `def ...` to `end` at the margin; any other line is one, too."""
+class _LineSession:
+    """One client of a port whose requests are lines.
 
-    def __init__(self, controller: EmulatedController) -> None:
-        self._controller = controller
-        self._rest = b""
-        self._program: list[str] | None = None
+    Args:
+        answer: executes a line; returns the bytes to send.
+    """
+
+    def __init__(self, answer: Callable[[bytes], bytes]) -> None:
+        self._answer, self._rest = answer, b""
 
     def receive(self, data: bytes, host: float) -> bytes:
-        """Uploads complete programs. Answers nothing (a real controller sends states)."""
+        """Executes complete lines; returns their answers."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        for raw in lines:
-            line = raw.decode("utf-8", "replace").rstrip("\r")
-            if self._program is not None:
-                self._program.append(line)
-                if line.startswith("end"):
-                    self._controller.upload("\n".join(self._program))
-                    self._program = None
-            elif line.startswith("def "):
-                self._program = [line]
-            elif line.strip():
-                self._controller.upload(line)
-        return b""
+        return b"".join(map(self._answer, lines))
 
     def close(self) -> None:
-        """Discards an incomplete program; a running program continues."""
+        """Discards an incomplete request; what earlier ones have started continues."""
+
+
+class ScriptSession(_LineSession):
+    """One client. A program runs from a line `def ...` to `end` at the margin; any other line is one, too.
+    Nothing is answered (a real controller sends states)."""
+
+    def __init__(self, controller: EmulatedController) -> None:
+        super().__init__(self._take)
+        self._controller = controller
+        self._program: list[str] | None = None
+
+    def _take(self, raw: bytes) -> bytes:
+        line = raw.decode("utf-8", "replace").rstrip("\r")
+        if self._program is not None:
+            self._program.append(line)
+            if line.startswith("end"):
+                self._controller.upload("\n".join(self._program))
+                self._program = None
+        elif line.startswith("def "):
+            self._program = [line]
+        elif line.strip():
+            self._controller.upload(line)
+        return b""
 
 
 WELCOME = b"Connected: Universal Robots Dashboard Server\n"
@@ -211,23 +223,14 @@ POWER = {
 """Power mode and answer of a command of the dashboard."""
 
 
-class DashboardSession:
-    """A client connection."""
+class DashboardSession(_LineSession):
+    """One client of the dashboard, which answers each line by a line."""
 
     def __init__(self, controller: EmulatedController) -> None:
+        super().__init__(lambda line: f"{self._execute(line.decode().strip())}\n".encode())
         self._controller = controller
-        self._rest = b""
 
-    def receive(self, data: bytes, host: float) -> bytes:
-        """Executes complete lines; returns one line of answer for each."""
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        return b"".join(f"{self._answer(line.decode().strip())}\n".encode() for line in lines)
-
-    def close(self) -> None:
-        """Has no effect."""
-
-    def _answer(self, command: str) -> str:
-        """Executes a command; returns the answer."""
+    def _execute(self, command: str) -> str:
         controller, name = self._controller, command.lower()
         power = POWER.get(name)
         if power is not None:
@@ -273,7 +276,7 @@ class Claims:
 
 
 class RtdeSession:
-    """_Connection of one client.
+    """One client of RTDE.
 
     Args:
         controller: the emulated controller. claims: shared by all clients.
@@ -375,3 +378,137 @@ class RtdeSession:
 def _split(names: bytes) -> list[str]:
     """Names in a comma-separated list; a trailing comma is allowed."""
     return [name for name in names.decode("ascii", "replace").split(",") if name]
+
+
+NAN: Value = (math.nan,) * 6
+
+
+class _ControllerFaults:
+    """Active faults and their effect on published states, by requests of one JSON object a line:
+
+    {"do": "stall", "seconds": 3}      nothing is sent to or read from RTDE clients; the arm continues
+    {"do": "malformed"}                sends an empty data package
+    {"do": "truncated"}                sends half a state, then complete states
+    {"do": "huge"}                     sends a package header with a length of 65535 bytes
+    {"do": "nan"}                      pose and speed are NaN, until "clear"
+    {"do": "freeze", "all": false}     the timestamp (or the whole state) is constant, until "clear"
+    {"do": "rate", "hz": 80}           states are sent at this rate, until "clear"
+    {"do": "close"}                    RTDE clients are disconnected
+    {"do": "protective"}, {"do": "safeguard"}, {"do": "emergency"}
+    {"do": "registers"}                a fieldbus holds the integer registers, until "clear"
+    {"do": "ik_fails"}                 inverse kinematics fails, until "clear"
+    {"do": "slider", "fraction": 0.1}  sets the speed slider
+    {"do": "remote", "on": false}      switches remote control
+    {"do": "place", "tcp": [6]}        sets the tool pose at once
+    {"do": "wall", "x": 0.8}           a wall at x (or y, z); "solid" 1 or -1 (default: side without the
+                                       tool), "stiffness" N/m; without an axis: removes all walls
+    {"do": "clear"}                    ends all of these; a safeguarded program resumes
+    {"do": "state"}                    state of the emulator, see `_state`
+    {"do": "die"}                      ends the process at once
+    """
+
+    def __init__(self, server: _ControllerServer) -> None:
+        self._server, self._controller = server, server.controller
+        self._active: dict[str, Any] = {}  # by name, with their values
+
+    @property
+    def stalled(self) -> bool:
+        return time.monotonic() < self._active.get("stall", -math.inf)
+
+    def sends_states(self, step: int) -> bool:
+        """Whether states are sent at this control step."""
+        hz = self._controller.config.hz
+        rate = self._active.get("rate", hz)
+        return not self.stalled and math.floor(step * rate / hz) > math.floor((step - 1) * rate / hz)
+
+    def overrides(self) -> dict[str, Value]:
+        """Fields with replaced values."""
+        return self._active.get("freeze", {}) | self._active.get("nan", {})
+
+    def answer(self, line: bytes) -> bytes:
+        """Executes a request; returns a JSON line, nothing for an empty one."""
+        return answer_fault(line, lambda request: do_fault(self.known, request)) if line.strip() else b""
+
+    @property
+    def known(self) -> dict[str, Callable[..., object]]:
+        """The functions of the faults, by name; each takes its arguments."""
+        controller, active = self._controller, self._active
+        arm, header, fields = controller.arm, rtde_protocol.HEADER, controller.registers.fields
+        return {
+            "stall": lambda seconds: active.update(stall=time.monotonic() + float(seconds)),
+            "malformed": lambda: self._send(lambda _: header.pack(0, rtde_protocol.DATA)),
+            "truncated": lambda: self._send(lambda state: state[: len(state) // 2]),
+            "huge": lambda: self._send(lambda _: header.pack(0xFFFF, rtde_protocol.DATA)),
+            "nan": lambda: active.update(nan={"actual_TCP_pose": NAN, "actual_TCP_speed": NAN}),
+            "freeze": lambda all=False: active.update(
+                freeze=dict(fields) if all else {"timestamp": fields["timestamp"]}
+            ),
+            "rate": lambda hz: active.update(rate=float(hz)),
+            "close": self._close_clients,
+            "protective": controller.protective_stop,
+            "safeguard": controller.safeguard_stop,
+            "emergency": controller.emergency_stop,
+            "registers": lambda: setattr(self._server.claims, "held_by_fieldbus", True),
+            "ik_fails": lambda: setattr(controller, "ik_fails", True),
+            "slider": lambda fraction: setattr(arm, "scale", min(1.0, max(0.0, float(fraction)))),
+            "remote": lambda on: setattr(controller, "remote", bool(on)),
+            "place": lambda tcp: arm.place(vector6(map(float, tcp))),
+            "wall": self._add_walls,
+            "clear": self._clear,
+            "state": self._state,
+            "die": lambda: os._exit(1),
+        }
+
+    def _state(self) -> dict[str, Any]:
+        """Robot time, s; tool pose, speed and force; joints; the last targets; counts; modes by name."""
+        controller, arm = self._controller, self._controller.arm
+        return {
+            "time": controller.time,
+            "host_time": time.monotonic(),
+            "tcp": list(arm.state.tcp),
+            "speed": list(arm.state.speed),
+            "joints": list(arm.state.joints),
+            "force": list(arm.force),
+            "moving": arm.moving,
+            "targets": list(controller.targets),
+            "penetration_max": arm.penetration_max,
+            "watchdog_stops": controller.watchdog_stops,
+            "program_stops": controller.program_stops,
+            "programs": controller.programs,
+            "runtime": controller.runtime.name,
+            "safety": controller.safety.name,
+            "mode": controller.robot_mode.name,
+            "clients": len(self._server.rtde),
+            "ignored": sum(session.ignored for _, session in self._server.rtde),
+        }
+
+    def _send(self, damage: Callable[[bytes], bytes]) -> None:
+        """Sends a damaged state to all clients of states."""
+        for connection, session in self._server.rtde:
+            if session.started:
+                self._server.send(connection, damage(session.state({})))
+
+    def _close_clients(self) -> None:
+        for connection, _ in self._server.rtde:
+            self._server.close(connection)
+
+    def _add_walls(self, **request: Any) -> None:
+        arm = self._controller.arm
+        arm.walls = arm.walls if set("xyz") & set(request) else []
+        for axis in set("xyz") & set(request):
+            at = float(request[axis])
+            beyond = 1 if arm.state.tcp["xyz".index(axis)] <= at else -1
+            arm.walls.append(
+                WallConfig.model_validate(
+                    {"axis": axis, "at": at, "solid": request.get("solid", beyond)}
+                    | {key: request[key] for key in ("stiffness",) if key in request}
+                )
+            )
+
+    def _clear(self) -> None:
+        self._active.clear()
+        self._server.claims.held_by_fieldbus = False
+        self._controller.ik_fails = False
+        self._controller.remote = self._controller.config.remote
+        self._controller.arm.scale = 1.0
+        self._controller.clear()

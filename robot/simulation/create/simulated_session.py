@@ -85,13 +85,23 @@ class CreateSimulation(SimulatedSource):
     def __init__(self, config: CreateSimulationConfig) -> None:
         self.config = config
         self.arena = make_arena(config.arena, config.seed)
-        walls, random = wall_segments(self.arena), stream(config.seed, "strain")
-        robot = CreateRobot(config.behaviour, config.whiskers, walls, random)
+        walls, noise = wall_segments(self.arena), stream(config.seed, "strain")
+        robot = _CreateRobot(config.behaviour, config.whiskers, walls, noise)
         self.whiskers = len(robot.whiskers.base)
-        start = robot.at(self.arena.start)
-        self.steps = steps = list(_drive_steps(config, robot, start))
+        start, random = robot.at(self.arena.start), stream(config.seed, "behaviour")
+        self.steps: list[_CreateStep] = []
+        step, doing, time = start, MachineState(CreateState.FWD1), 0.0
+        while (len(self.steps) < config.reports) if config.reports else (time < 60 * config.minutes):
+            before, command = step, wheel_command(config.behaviour, doing)
+            step = robot.step(before, doing.state, command)
+            self.steps.append(step)
+            time += step.duration
+            turned = float(step.pose[2] - before.pose[2])
+            doing = next_state(config.behaviour, doing, step.moment, turned, random)
+        steps = self.steps
         duration = np.array([step.duration for step in steps])
         self.time = np.cumsum(duration)
+        self.rate_hz = rate_of(self.time)
         pose = np.array([start.pose, *(step.pose for step in steps)])
         self.truth = wrap_headings(pose[1:])
         motion = np.column_stack([between(pose[:-1], pose[1:])[:, :2], np.diff(pose[:, 2]), duration])
@@ -100,10 +110,6 @@ class CreateSimulation(SimulatedSource):
         self.info = describe_create(config, self.arena)
         document = {"create_simulation": self.info.provenance["create_simulation"], "arena": self.info.arena}
         self.digest = digest_of_document(document)
-
-    @property
-    def rate_hz(self) -> float:
-        return rate_of(self.time)
 
     def _readings(self) -> Iterator[Report]:
         return (make_report(self.config, step, NO_ODOMETRY) for step in self.steps)
@@ -118,20 +124,6 @@ def describe_create(config: CreateSimulationConfig, arena: Arena) -> SourceInfo:
         arena=arena_text(arena),
         provenance={"create_simulation": config.model_dump(mode="json", exclude={"arena": {"file"}})},
     )
-
-
-def _drive_steps(
-    config: CreateSimulationConfig, robot: CreateRobot, start: CreateStep
-) -> Iterator[CreateStep]:
-    random = stream(config.seed, "behaviour")
-    step, doing, time, count = start, MachineState(CreateState.FWD1), 0.0, 0
-    while (count < config.reports) if config.reports else (time < 60 * config.minutes):
-        before = step
-        step = robot.step(before, doing.state, wheel_command(config.behaviour, doing))
-        time, count = time + step.duration, count + 1
-        turned = float(step.pose[2] - before.pose[2])
-        doing = next_state(config.behaviour, doing, step.moment, turned, random)
-        yield step
 
 
 HALF_WALL = 10.0
@@ -163,7 +155,7 @@ def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.ran
     room += APPROACH * random.uniform(0.5, 1.0) * towards[0]
     along = HALF_WALL * np.array([np.cos(angle), np.sin(angle)])
     wall = np.concatenate([room * towards - along, room * towards + along])[None]
-    robot = CreateRobot(behaviour, whiskers, wall, random)
+    robot = _CreateRobot(behaviour, whiskers, wall, random)
     step = robot.at(np.zeros(3))
     while step.moment == StepEnd.FREE and step.pose[0] < 2 * APPROACH + whiskers.length:
         step = robot.step(step, CreateState.FWD1, WheelCommand(behaviour.fast, 0.0, behaviour.step))
@@ -175,11 +167,11 @@ def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.ran
         raise InputError("create_simulation.behaviour.contact", found, expected)
     patient = behaviour.model_copy(update={"safety": np.inf, "least": RECORD_TIME})
     command = WheelCommand(behaviour.slow, 0.0, RECORD_TIME)
-    push = CreateRobot(patient, whiskers, wall, random).step(step, CreateState.FWD2, command)
+    push = _CreateRobot(patient, whiskers, wall, random).step(step, CreateState.FWD2, command)
     return make_report(config, push, Odometry(behaviour.slow * RECORD_TIME, 0.0, 0.0, RECORD_TIME))
 
 
-def make_report(config: CreateSimulationConfig, step: CreateStep, odometry: Odometry) -> Report:
+def make_report(config: CreateSimulationConfig, step: _CreateStep, odometry: Odometry) -> Report:
     """A step as a reading."""
     return Report(
         odometry=odometry,
@@ -192,15 +184,9 @@ def make_report(config: CreateSimulationConfig, step: CreateStep, odometry: Odom
     )
 
 
-def train_strain_templates(
-    config: CreateSimulationConfig, training: TemplateTraining | None = None
-) -> StrainTemplates:
-    """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G).
-
-    Raises:
-        InputError: the training has another sample rate than the whiskers.
-    """
-    training = training or TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
+def train_strain_templates(config: CreateSimulationConfig) -> StrainTemplates:
+    """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G)."""
+    training = TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
     random = stream(config.seed, "templates")
     return train_templates(
         (
@@ -216,7 +202,7 @@ MIN_DURATION = 1e-6
 """Shortest duration of a motion, s."""
 
 
-class CreateStep(NamedTuple):
+class _CreateStep(NamedTuple):
     """One motion of the robot.
 
     Attributes:
@@ -234,7 +220,7 @@ class CreateStep(NamedTuple):
     strain: np.ndarray
 
 
-class CreateRobot:
+class _CreateRobot:
     """The Create among walls [S, 4] (x1, y1, x2, y2, m).
 
     Attributes:
@@ -252,13 +238,13 @@ class CreateRobot:
         self.whiskers = fixed_whiskers(whiskers)
         self._random = random
 
-    def at(self, pose: np.ndarray) -> CreateStep:
+    def at(self, pose: np.ndarray) -> _CreateStep:
         """The state before the first motion from a pose."""
         free = np.zeros(len(self.whiskers.base), int)
         none = np.zeros((0, len(free), 2))
-        return CreateStep(CreateState.FWD1, StepEnd.FREE, 0.0, pose, free, free.astype(bool), none)
+        return _CreateStep(CreateState.FWD1, StepEnd.FREE, 0.0, pose, free, free.astype(bool), none)
 
-    def step(self, last: CreateStep, state: CreateState, command: WheelCommand) -> CreateStep:
+    def step(self, last: _CreateStep, state: CreateState, command: WheelCommand) -> _CreateStep:
         """Execute a motion until its planned or early end."""
         config = self.behaviour
         count = planned_rows(config, command)
@@ -274,24 +260,16 @@ class CreateRobot:
         if len(near):
             gap = segment_distance(near, np.vstack([last.pose, poses])[:, :2]).min(axis=1)
             bumped = (gap[1:] < config.body) & (np.diff(gap) < 0)
-        row, moment = motion_end(config, state, known, bumped, last.contact)
+        end = motion_end(config, state, known, bumped, last.contact, count - 1)
+        assert end is not None
+        row, moment = end
         duration = float(time[row])
-        return CreateStep(
-            state,
-            moment,
-            duration,
-            poses[row],
-            bent.side[row],
-            np.abs(known[row, :, 0]) > config.contact,
-            self._sampled_strain(last, near, command, duration if state == CreateState.FWD2 else 0.0),
-        )
-
-    def _sampled_strain(
-        self, last: CreateStep, near: np.ndarray, command: WheelCommand, duration: float
-    ) -> np.ndarray:
-        time = np.arange(round(duration * self.sensors.rate)) / self.sensors.rate
-        if not len(time):
-            return np.zeros((0, len(self.whiskers.base), 2))
-        bent = bend_whiskers(self.whiskers, drive(command, last.pose, time), near, last.side)
-        strain = base_strains(self.sensors, self.whiskers, bent)
-        return sample_strain(self.sensors, strain, self.whiskers.alive, self._random)
+        contact = np.abs(known[row, :, 0]) > config.contact
+        samples = round(duration * self.sensors.rate) if state == CreateState.FWD2 else 0
+        sampled = np.zeros((0, len(contact), 2))
+        if samples:
+            poses_sampled = drive(command, last.pose, np.arange(samples) / self.sensors.rate)
+            bent_then = bend_whiskers(self.whiskers, poses_sampled, near, last.side)
+            strain = base_strains(self.sensors, self.whiskers, bent_then)
+            sampled = sample_strain(self.sensors, strain, self.whiskers.alive, self._random)
+        return _CreateStep(state, moment, duration, poses[row], bent.side[row], contact, sampled)

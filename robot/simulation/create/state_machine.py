@@ -117,15 +117,6 @@ def wheel_command(config: BehaviourConfig, doing: MachineState) -> WheelCommand:
     return WheelCommand(0.0, rate, min(whole, config.turn.step or whole))
 
 
-def draw_turn(config: TurnConfig, random: np.random.Generator) -> float:
-    """A random turn angle, rad, limited to half a turn either way."""
-    which, normal = random.random(), random.standard_normal()
-    small = which < config.share
-    mean, spread = (config.small, config.small_spread) if small else (config.large, config.large_spread)
-    sd = np.sqrt(spread) if config.spread == "variance" else spread
-    return float(np.clip(mean + sd * normal, -np.pi, np.pi))
-
-
 def drive(command: WheelCommand, pose: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Poses [T, 3] at times [T] s of a motion from a pose, straight or on the spot."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -133,30 +124,12 @@ def drive(command: WheelCommand, pose: np.ndarray, time: np.ndarray) -> np.ndarr
     return np.column_stack([pose[0] + c * ahead, pose[1] + s * ahead, pose[2] + turned])
 
 
-def motion_end(
-    config: BehaviourConfig, state: CreateState, strain: np.ndarray, bumped: np.ndarray, before: np.ndarray
-) -> tuple[int, StepEnd]:
-    """The end of a motion in a state: row of the monitored strain, and kind of end.
-
-    Args:
-        strain: [T, W, 2] and bumped: [T] bool, monitored every `period`; the last row is the planned end.
-            before: [W] bool, whiskers in contact at its start.
-    """
-    last = len(strain) - 1
-    return early_end(config, state, strain, bumped, before, last) or planned_end(state, last)
-
-
 def planned_rows(config: BehaviourConfig, command: WheelCommand) -> int:
     """Rows of the monitor in a motion of the planned duration, at least 1."""
     return max(int(np.ceil(command.duration / config.period - 1e-9)), 1)
 
 
-def planned_end(state: CreateState, last: int) -> tuple[int, StepEnd]:
-    """The end of a motion that nothing has ended before row `last`."""
-    return last, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE
-
-
-def early_end(
+def motion_end(
     config: BehaviourConfig,
     state: CreateState,
     strain: np.ndarray,
@@ -164,30 +137,35 @@ def early_end(
     before: np.ndarray,
     last: int,
 ) -> tuple[int, StepEnd] | None:
-    """The end of a motion by whiskers or body; None if the rows so far have none.
+    """The end of a motion in a state, by whiskers, body or time: row of the monitored strain, and kind of
+    end; None if the rows so far have none.
 
     Args:
-        strain, bumped, before: as in `motion_end`, rows so far. last: row of the planned end.
+        strain: [T, W, 2] and bumped: [T] bool, monitored every `period`. before: [W] bool, whiskers in
+            contact at its start. last: row of the planned end.
     """
-    if state == CreateState.BACK:  # only a contact of the body ends BACK early
-        return (_first(bumped), StepEnd.FREE) if bumped.any() else None
-    level = np.abs(strain[..., 0])
-    over = np.abs(strain).max(axis=2) > config.safety
-    if state == CreateState.TURN:
-        # Whiskers above the safe limit from the start end a turn only if their strain increases.
-        over &= level > 1.1 * level[0]
     ends = []
-    stop = over.any(axis=1) | bumped
-    if stop.any():
-        ends.append((_first(stop), 1, StepEnd.ABORT))
-    touching = level > config.contact
-    if state == CreateState.FWD1 and touching.any():
-        ends.append((_first(touching.any(axis=1)), 2, StepEnd.HIT1))
-    if state == CreateState.FWD2:
-        ever = np.logical_or.accumulate(touching | before, axis=0).sum(axis=1) >= 2
-        ever[: min(round(config.least / config.period), last)] = False
-        if ever.any():
-            ends.append((_first(ever), 2, StepEnd.HIT2))
+    if len(strain) > last:
+        ends.append((last, 3, StepEnd.ABORT if state == CreateState.FWD2 else StepEnd.FREE))
+    if state == CreateState.BACK:  # only a contact of the body ends BACK early
+        ends += [(_first(bumped), 1, StepEnd.FREE)] if bumped.any() else []
+    else:
+        level = np.abs(strain[..., 0])
+        over = np.abs(strain).max(axis=2) > config.safety
+        if state == CreateState.TURN:
+            # Whiskers above the safe limit from the start end a turn only if their strain increases.
+            over &= level > 1.1 * level[0]
+        stop = over.any(axis=1) | bumped
+        if stop.any():
+            ends.append((_first(stop), 1, StepEnd.ABORT))
+        touching = level > config.contact
+        if state == CreateState.FWD1 and touching.any():
+            ends.append((_first(touching.any(axis=1)), 2, StepEnd.HIT1))
+        if state == CreateState.FWD2:
+            ever = np.logical_or.accumulate(touching | before, axis=0).sum(axis=1) >= 2
+            ever[: min(round(config.least / config.period), last)] = False
+            if ever.any():
+                ends.append((_first(ever), 2, StepEnd.HIT2))
     if not ends:
         return None
     row, _, moment = min(ends)
@@ -206,13 +184,19 @@ def next_state(
     random: np.random.Generator,
     least_turn: float = MIN_TURN,
 ) -> MachineState:
-    """The next state after a step that ended at `moment` and turned by `turned` rad.
+    """The next state after a step that ended at `moment` and turned by `turned` rad. The turn after BACK is
+    drawn, at most half a turn either way.
 
     Args:
         least_turn: remaining turn that is not executed any more, rad: that which the odometry resolves.
     """
     if doing.state == CreateState.BACK:
-        return MachineState(CreateState.TURN, draw_turn(config.turn, random))
+        which, normal = random.random(), random.standard_normal()
+        mean, spread = config.turn.small, config.turn.small_spread
+        if which >= config.turn.share:
+            mean, spread = config.turn.large, config.turn.large_spread
+        sd = np.sqrt(spread) if config.turn.spread == "variance" else spread
+        return MachineState(CreateState.TURN, float(np.clip(mean + sd * normal, -np.pi, np.pi)))
     if doing.state == CreateState.FWD2 or moment == StepEnd.ABORT:
         return MachineState(CreateState.BACK)
     rest = doing.rest - turned

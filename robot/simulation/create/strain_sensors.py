@@ -36,16 +36,6 @@ BISECTIONS = 24
 """Bisection steps in the search of the contact position, accurate to 10 nm."""
 
 
-class Shaft(NamedTuple):
-    """Attributes:
-    length: m. radius: at its base, m. taper: k, 1/m.
-    """
-
-    length: float
-    radius: float
-    taper: float
-
-
 class Bending(NamedTuple):
     """Bending of whiskers [T, W]; zero where free, with the length as reach.
 
@@ -61,53 +51,10 @@ class Bending(NamedTuple):
     side: np.ndarray
 
 
-def base_strain(shaft: Shaft, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Surface strain at the base, M r0 / (E I), with the sign of the rotation."""
-    return 3 * shaft.radius * (1 / reach - shaft.taper) * turn
-
-
-def shaft_tilt(shaft: Shaft, reach: np.ndarray) -> np.ndarray:
+def shaft_tilt(fan: FixedWhiskers, reach: np.ndarray) -> np.ndarray:
     """Ratio of the shaft's tilt at the contact to the rotation of the line from base to contact."""
-    narrow = shaft.taper * reach
+    narrow = fan.taper * reach
     return (3 - 2 * narrow) / (2 * (1 - narrow))
-
-
-def bend_shafts(
-    shaft: Shaft, base: np.ndarray, direction: np.ndarray, segments: np.ndarray, side: np.ndarray
-) -> Bending:
-    """Bending of whiskers among walls.
-
-    Args:
-        base: [T, W, 2] positions of the bases in order of time, m. direction: [T, W] of straight shafts, rad.
-        segments: [S, 4] m. side: [W] as in `Bending`, before the first row.
-    """
-    free, no_side = np.zeros(direction.shape), np.zeros(direction.shape, int)
-    nothing = Bending(free, free + shaft.length, free, no_side)
-    if not len(segments):
-        return nothing
-    low, high = _blocked_ends(shaft, base, direction, segments)
-    blocked = np.any((low.angle < 0) & (high.angle > 0), axis=-1)
-    if not blocked.any():
-        return nothing
-    row, whisker = np.nonzero(blocked)
-    low, high = (_Ends(*(column[row, whisker] for column in ends)) for ends in (low, high))
-    left = _free_ends(low, high)
-    right = _free_ends(high._replace(angle=-high.angle), low._replace(angle=-low.angle))
-    easier = no_side.copy()
-    easier[row, whisker] = np.where(left.angle <= right.angle, 1, -1)
-    # A whisker bends to the easier side at first contact, and to the same side as long as it is blocked.
-    was = np.vstack([side != 0, blocked[:-1]])
-    rows = np.arange(len(blocked))[:, None]
-    onset = np.maximum.accumulate(np.where(blocked & ~was, rows, -1), axis=0)
-    since = np.where(onset >= 0, np.take_along_axis(easier, np.maximum(onset, 0), axis=0), side)
-    sides = np.where(blocked, since, 0)
-    way = sides[row, whisker]
-    chosen = _Ends(*(np.where(way > 0, a, b) for a, b in zip(left, right, strict=True)))
-    turn, reach, lean = (free.copy() for _ in range(3))
-    reach += shaft.length
-    angle, reach[row, whisker], lean[row, whisker] = _solve_contacts(shaft, chosen)
-    turn[row, whisker] = way * angle
-    return Bending(turn, reach, lean, sides)
 
 
 class _Ends(NamedTuple):
@@ -122,7 +69,7 @@ class _Ends(NamedTuple):
 
 
 def _blocked_ends(
-    shaft: Shaft, base: np.ndarray, direction: np.ndarray, segments: np.ndarray
+    fan: FixedWhiskers, base: np.ndarray, direction: np.ndarray, segments: np.ndarray
 ) -> tuple[_Ends, _Ends]:
     """Lower and upper ends [T, W, S] of the angles, relative to the straight shaft, that walls block. For a
     wall out of reach the lower end is above the upper one."""
@@ -132,7 +79,7 @@ def _blocked_ends(
     x, y, u, v = c * x + s * y, c * y - s * x, c * u + s * v, c * v - s * u
     # The part of each wall within reach of the base.
     square, middle = u * u + v * v, -(x * u + y * v)
-    inner = middle**2 - square * (x * x + y * y - shaft.length**2)
+    inner = middle**2 - square * (x * x + y * y - fan.length**2)
     half = np.sqrt(np.maximum(inner, 0.0))
     first, last = np.maximum((middle - half) / square, 0.0), np.minimum((middle + half) / square, 1.0)
     there = (inner > 0) & (first < last)
@@ -163,25 +110,25 @@ def _free_ends(low: _Ends, high: _Ends) -> _Ends:
     return _Ends(angle, radius, near, away)
 
 
-def _solve_contacts(shaft: Shaft, end: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _solve_contacts(fan: FixedWhiskers, end: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rotation, reach and lean [K] of whiskers in contact at that end."""
     turn, reach = end.angle.copy(), end.radius.copy()
-    tip = end.radius >= shaft.length * (1 - 1e-9)
+    tip = end.radius >= fan.length * (1 - 1e-9)
     away = np.minimum(end.away, reach * (1 - 1e-12))
     slant = np.arcsin(away / reach)  # angle between the line to the contact and the wall
-    lean = np.where(tip, slant, (shaft_tilt(shaft, reach) - 1) * turn)
-    flat = np.flatnonzero(tip & ((shaft_tilt(shaft, reach) - 1) * turn > slant))
+    lean = np.where(tip, slant, (shaft_tilt(fan, reach) - 1) * turn)
+    flat = np.flatnonzero(tip & ((shaft_tilt(fan, reach) - 1) * turn > slant))
     if len(flat):
         wall = turn[flat] + slant[flat]  # angle between the straight shaft and the wall
-        near, far = end.near[flat], np.full(len(flat), shaft.length)
+        near, far = end.near[flat], np.full(len(flat), fan.length)
         for _ in range(BISECTIONS):
             middle = (near + far) / 2
             slope = np.arcsin(np.minimum(away[flat] / middle, 1.0))
-            beyond = (shaft_tilt(shaft, middle) - 1) * (wall - slope) > slope
+            beyond = (shaft_tilt(fan, middle) - 1) * (wall - slope) > slope
             near, far = np.where(beyond, near, middle), np.where(beyond, middle, far)
         reach[flat] = far
         turn[flat] = wall - np.arcsin(np.minimum(away[flat] / far, 1.0))
-        lean[flat] = (shaft_tilt(shaft, far) - 1) * turn[flat]
+        lean[flat] = (shaft_tilt(fan, far) - 1) * turn[flat]
     return turn, reach, lean
 
 
@@ -258,24 +205,27 @@ class FixedWhiskers(NamedTuple):
     """Whiskers fixed to the body.
 
     Attributes:
-        base: [W, 2] m and direction: [W] rad in base_link. shaft: of all whiskers. alive: [W] bool.
+        base: [W, 2] m and direction: [W] rad in base_link. length: m, radius: at the base, m, and taper: k,
+            1/m, of all whiskers. alive: [W] bool.
     """
 
     base: np.ndarray
     direction: np.ndarray
-    shaft: Shaft
+    length: float
+    radius: float
+    taper: float
     alive: np.ndarray
 
     @property
     def reach(self) -> float:
         """Largest distance of a contact from the centre of the body, m."""
-        return float(np.hypot(self.base[:, 0], self.base[:, 1]).max()) + self.shaft.length
+        return float(np.hypot(self.base[:, 0], self.base[:, 1]).max()) + self.length
 
     @property
     def tip(self) -> np.ndarray:
         """Tips [W, 2] of straight whiskers in base_link, m."""
         way = np.stack([np.cos(self.direction), np.sin(self.direction)], axis=1)
-        return self.base + self.shaft.length * way
+        return self.base + self.length * way
 
 
 def fixed_whiskers(config: WhiskersConfig) -> FixedWhiskers:
@@ -285,94 +235,104 @@ def fixed_whiskers(config: WhiskersConfig) -> FixedWhiskers:
     taper = (1 - config.tip_diameter / config.base_diameter) / config.length
     alive = np.ones(len(base), bool)
     alive[list(config.dead)] = False
-    return FixedWhiskers(base, direction, Shaft(config.length, config.base_diameter / 2, taper), alive)
+    return FixedWhiskers(base, direction, config.length, config.base_diameter / 2, taper, alive)
 
 
 def bend_whiskers(fan: FixedWhiskers, pose: np.ndarray, segments: np.ndarray, side: np.ndarray) -> Bending:
-    """Bending of whiskers at poses [T, 3] in order of time among walls [S, 4]; `side` as in `bend_shafts`."""
+    """Bending of whiskers among walls.
+
+    Args:
+        pose: [T, 3] of the body in order of time, m, m, rad. segments: [S, 4] m. side: [W] as in `Bending`,
+            before the first row.
+    """
     c, s = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
     x, y = fan.base.T
     base = np.stack([pose[:, :1] + c * x - s * y, pose[:, 1:2] + s * x + c * y], axis=-1)
-    return bend_shafts(fan.shaft, base, pose[:, 2:] + fan.direction, segments, side)
+    direction = pose[:, 2:] + fan.direction
+    free, no_side = np.zeros(direction.shape), np.zeros(direction.shape, int)
+    nothing = Bending(free, free + fan.length, free, no_side)
+    if not len(segments):
+        return nothing
+    low, high = _blocked_ends(fan, base, direction, segments)
+    blocked = np.any((low.angle < 0) & (high.angle > 0), axis=-1)
+    if not blocked.any():
+        return nothing
+    row, whisker = np.nonzero(blocked)
+    low, high = (_Ends(*(column[row, whisker] for column in ends)) for ends in (low, high))
+    left = _free_ends(low, high)
+    right = _free_ends(high._replace(angle=-high.angle), low._replace(angle=-low.angle))
+    easier = no_side.copy()
+    easier[row, whisker] = np.where(left.angle <= right.angle, 1, -1)
+    # A whisker bends to the easier side at first contact, and to the same side as long as it is blocked.
+    was = np.vstack([side != 0, blocked[:-1]])
+    rows = np.arange(len(blocked))[:, None]
+    onset = np.maximum.accumulate(np.where(blocked & ~was, rows, -1), axis=0)
+    since = np.where(onset >= 0, np.take_along_axis(easier, np.maximum(onset, 0), axis=0), side)
+    sides = np.where(blocked, since, 0)
+    way = sides[row, whisker]
+    chosen = _Ends(*(np.where(way > 0, a, b) for a, b in zip(left, right, strict=True)))
+    turn, reach, lean = (free.copy() for _ in range(3))
+    reach += fan.length
+    angle, reach[row, whisker], lean[row, whisker] = _solve_contacts(fan, chosen)
+    turn[row, whisker] = way * angle
+    return Bending(turn, reach, lean, sides)
 
 
 def base_strains(config: WhiskersConfig, fan: FixedWhiskers, bent: Bending) -> np.ndarray:
     """Horizontal and vertical strain [T, W, 2] of bent whiskers, without noise."""
-    across = base_strain(fan.shaft, bent.turn, bent.reach)
+    # The surface strain at the base, M r0 / (E I), with the sign of the rotation.
+    across = 3 * fan.radius * (1 / bent.reach - fan.taper) * bent.turn
     # The force along the shaft bends it by the lever of its droop, the force across it by its length.
     along = np.tan(np.minimum(bent.lean + np.arctan(config.friction), MAX_LEAN))
     down = np.tan(np.radians(config.droop_deg)) * np.abs(across) * along
     return np.stack([across, config.crosstalk * across - down], axis=-1) * fan.alive[:, None]
 
 
-def body_vibration(config: ShakeConfig, count: int, rate: float, random: np.random.Generator) -> np.ndarray:
-    """Horizontal and vertical strain [T, 2] from vibration of the body, from the start of a motion."""
-    from scipy.signal import lfilter  # slow to import
-
-    amplitude, phase = _draw_ringing(config, random)
-    ringing = _ringing(config, amplitude, phase, np.arange(count) / rate)
-    back = _resonance(config, rate)
-    lead = int(5 * config.decay * rate)  # until the transient has decayed
-    rumble = lfilter([1.0], back, random.standard_normal((lead + count, 2)), axis=0)[lead:]
-    return ringing + config.rumble / _gain(back) * rumble
-
-
 class BodyVibration:
-    """`body_vibration` of a robot that starts, rolls and stops, block by block."""
+    """Strain from vibration of the body, block by block: it rings from the start of a motion on, and its
+    wheels rumble while they roll."""
 
     def __init__(self, config: ShakeConfig, rate: float, random: np.random.Generator) -> None:
         self._config, self._rate, self._random = config, rate, random
-        self._back = _resonance(config, rate)
+        pole = np.exp((-1 / config.decay + 2j * np.pi * config.frequency) / rate)
+        a, b = -2 * pole.real, abs(pole) ** 2
+        self._back = [1.0, a, b]  # recursive coefficients of the resonance
+        # Standard deviation of the resonance driven by unit noise.
+        self._gain = float(np.sqrt((1 + b) / ((1 - b) * ((1 + b) ** 2 - a**2))))
         self._state = np.zeros((2, 2))
         self._since = 0  # samples since the last start
         self._amplitude = self._phase = np.zeros(2)
 
-    def advance(self, count: int, *, rolls: bool, starts: bool) -> np.ndarray:
-        """The next [T, 2] strains.
+    def start(self) -> None:
+        """Starts a motion."""
+        self._since = 0
+        self._amplitude = self._config.start * self._random.standard_normal(2)
+        self._phase = self._random.uniform(0, 2 * np.pi, 2)
 
-        Args:
-            rolls: whether the wheels turn. starts: whether a motion has started.
-        """
-        from scipy.signal import lfilter  # slow to import
-
-        if starts:
-            self._since = 0
-            self._amplitude, self._phase = _draw_ringing(self._config, self._random)
+    def ring(self, count: int) -> np.ndarray:
+        """The next [T, 2] horizontal and vertical strains of ringing."""
         time = (self._since + np.arange(count)) / self._rate
         self._since += count
+        damped, turned = np.exp(-time / self._config.decay), 2 * np.pi * self._config.frequency * time
+        return self._amplitude * damped[:, None] * np.sin(turned[:, None] + self._phase)
+
+    def rumble(self, count: int, rolls: bool = True) -> np.ndarray:
+        """The next [T, 2] strains of rumble, which goes on when the wheels no longer roll."""
+        from scipy.signal import lfilter  # slow to import
+
         drive = self._random.standard_normal((count, 2)) * rolls
         rumble, self._state = lfilter([1.0], self._back, drive, axis=0, zi=self._state)
-        ringing = _ringing(self._config, self._amplitude, self._phase, time)
-        return ringing + self._config.rumble / _gain(self._back) * rumble
-
-
-def _draw_ringing(config: ShakeConfig, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitude and phase [2] of the vibration at the start of a motion."""
-    return config.start * random.standard_normal(2), random.uniform(0, 2 * np.pi, 2)
-
-
-def _ringing(config: ShakeConfig, amplitude: np.ndarray, phase: np.ndarray, time: np.ndarray) -> np.ndarray:
-    damped = np.exp(-time / config.decay)
-    return amplitude * damped[:, None] * np.sin(2 * np.pi * config.frequency * time[:, None] + phase)
-
-
-def _resonance(config: ShakeConfig, rate: float) -> list[float]:
-    """Recursive coefficients of the resonance at a sample rate, Hz."""
-    pole = np.exp((-1 / config.decay + 2j * np.pi * config.frequency) / rate)
-    return [1.0, -2 * pole.real, abs(pole) ** 2]
-
-
-def _gain(back: list[float]) -> float:
-    """Standard deviation of a second-order resonance driven by unit noise."""
-    _, a, b = back
-    return float(np.sqrt((1 + b) / ((1 - b) * ((1 + b) ** 2 - a**2))))
+        return self._config.rumble / self._gain * rumble
 
 
 def sample_strain(
     config: WhiskersConfig, strain: np.ndarray, alive: np.ndarray, random: np.random.Generator
 ) -> np.ndarray:
     """Sensor readings [T, W, 2] of strain [T, W, 2] at the sensor rate, from the start of a motion."""
-    shake = body_vibration(config.shake, len(strain), config.rate, random)
+    shaking = BodyVibration(config.shake, config.rate, random)
+    shaking.start()
+    shaking.rumble(int(5 * config.shake.decay * config.rate))  # until the transient has decayed
+    shake = shaking.ring(len(strain)) + shaking.rumble(len(strain))
     read = strain + shake[:, None] + config.noise * random.standard_normal(strain.shape)
     return np.where(alive[:, None], read, 0.0)
 

@@ -33,10 +33,6 @@ class BeamConfig(Settings):
     friction: NonNegativeFloat = 0.3
     """Coulomb friction coefficient of a whisker on a wall."""
 
-    def time_unit(self, length: float) -> float:
-        """Time unit of the unit beam for a whisker of a length (m), s."""
-        return float(length**2 * 2 / self.radius * np.sqrt(self.density / self.modulus))
-
 
 class ServoConfig(Settings):
     """A drive as a spring and damper on a rotor; its stiffness is `MechanicsConfig.servo`."""
@@ -102,8 +98,8 @@ def make_beam(config: ShaftConfig) -> Beam:
     line = thick**2
     return Beam(
         shapes=shapes,
-        stiffness=_inner(bent * thick**4, bent),
-        mass=_inner(line * shapes, shapes),
+        stiffness=_integrate((bent * thick**4)[:, None] * bent)[..., -1],
+        mass=_integrate((line * shapes)[:, None] * shapes)[..., -1],
         coupled=_integrate(line * SHAFT_SHARES * shapes)[:, -1],
         inertia=float(_integrate(line * SHAFT_SHARES**2)[-1]),
         moment=loads,
@@ -115,7 +111,3 @@ def _integrate(value: np.ndarray) -> np.ndarray:
     """Cumulative integral along the whisker (trapezoidal rule)."""
     steps = (value[..., 1:] + value[..., :-1]) / 2 * np.diff(SHAFT_SHARES)
     return np.concatenate([np.zeros((*value.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
-
-
-def _inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return _integrate(a[:, None] * b[None])[..., -1]

@@ -80,16 +80,35 @@ def simulate_kinematic(
     start: np.ndarray,
     random: np.random.Generator,
 ) -> WhiskColumns:
-    """Contact features of whisk cycles that start at times [N] s along a path."""
-    met = _find_contacts(setup, surroundings, path, start)
-    return _add_sensor_noise(setup, _bend_whiskers(setup, *met), random)
+    """Contact features of whisk cycles that start at times [N] s along a path, with noise and faults of the
+    sensors."""
+    features = _touch_walls(setup, surroundings, path, start)
+    config, shape, alive = setup.mechanics, features.contact.shape, setup.head.alive
+    missed = random.random(shape) < config.missed
+    spurious = ~features.contact & (random.random(shape) < config.spurious)
+    anywhere = random.random(shape) * np.radians(setup.whisking.amplitude_deg)
+    noise = config.noise * random.standard_normal((2, *shape))
+    noise = noise * np.array([1.0, MEAN_NOISE_SHARE])[:, None, None]
+    smeared = config.reach_noise * random.standard_normal(shape)
+    contact = ((features.contact & ~missed) | spurious) & alive
+    touched = np.where(spurious, anywhere, features.touched)
+    highest = np.where(spurious, anywhere, features.highest + noise[1])
+    return WhiskColumns(
+        contact=contact,
+        touched=np.where(contact, touched + noise[0], 0.0),
+        held=((features.held & ~missed) | spurious) & alive,
+        highest=np.where(alive, highest, 0.0),
+        reach=np.where(contact, np.clip(features.reach + smeared, 0.0, 1.0), 0.0),
+    )
 
 
-def _find_contacts(
+def _touch_walls(
     setup: HeadSetup, surroundings: Surroundings, path: HeadPath, start: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Contacts [N, W]: presence, protraction (rad), position along the shaft, and the latter two (infinite
-    and 1 without contact) at the end of the protraction."""
+) -> WhiskColumns:
+    """Contacts [N, W] with the walls, and how they bend and turn the whiskers, without noise.
+
+    A whisker touched near its base is stiffer: it bends less and its sensor reads more.
+    """
     head, _, config, whisking = setup
     whiskers, count = len(head.length), len(start)
     amplitude = np.radians(whisking.amplitude_deg)
@@ -111,36 +130,21 @@ def _find_contacts(
     stands = np.where(contact, at_pose(wall, first), 0.0)
     touched = np.where(contact, np.maximum(stands, np.where(new, midway[first], before[first])), 0.0)
     reach = np.where(contact, np.maximum(at_pose(along, first), MIN_REACH), 1.0)
-    last = wall[:, -1] + touched - stands
-    return contact, touched, reach, last, np.where(np.isfinite(last), along[:, -1], 1.0)
+    last = wall[:, -1] + touched - stands  # the wall at the end of the protraction, rad
+    there = np.isfinite(last)
 
-
-def _bend_whiskers(
-    setup: HeadSetup,
-    contact: np.ndarray,
-    met: np.ndarray,
-    reach: np.ndarray,
-    last: np.ndarray,
-    last_reach: np.ndarray,
-) -> WhiskColumns:
-    """Bend and rotation of whiskers in contacts as from `_find_contacts`; met: protraction.
-
-    A whisker touched near its base is stiffer: it bends less and its sensor reads more.
-    """
-    config, amplitude = setup.mechanics, np.radians(setup.whisking.amplitude_deg)
     hard = stiffness(SHAFT, reach)
     push = hard * config.servo / (config.servo + hard)  # reading for each radian commanded beyond contact
-    reading = np.where(contact, push * (amplitude - met), 0.0)
+    reading = np.where(contact, push * (amplitude - touched), 0.0)
     reading, taken = _apply_feedback(setup, reading, push)
-    there = np.isfinite(last)
     last = np.where(there, last, 0.0)
-    hard_last = stiffness(SHAFT, np.maximum(last_reach, MIN_REACH))
+    hard_last = stiffness(SHAFT, np.where(there, np.maximum(along[:, -1], MIN_REACH), 1.0))
     bend = np.where(there, config.servo / (config.servo + hard_last) * (amplitude - taken - last), 0.0)
     noticed = contact & (np.maximum(reading, hard_last * bend) > config.dead_zone)
     # Slip depends on the bend at the end; a contact is held if its reading still exceeds the dead zone.
     held = noticed & there & (bend <= config.slip) & (hard_last * bend > config.dead_zone)
     highest = np.where(held, last + bend, amplitude - taken)
-    touched = np.where(noticed, met + config.dead_zone, 0.0)
+    touched = np.where(noticed, touched + config.dead_zone, 0.0)
     return WhiskColumns(noticed, touched, held, highest, reach)
 
 
@@ -159,24 +163,3 @@ def _apply_feedback(setup: HeadSetup, reading: np.ndarray, push: np.ndarray) -> 
         taken = np.where(led, whisking.follow * neighbour_max(taken, head.shape), taken)
         reading = np.where(led, np.maximum(reading - push * taken, 0.0), reading)
     return reading, taken
-
-
-def _add_sensor_noise(setup: HeadSetup, features: WhiskColumns, random: np.random.Generator) -> WhiskColumns:
-    """Add noise and faults of the sensors."""
-    config, shape, alive = setup.mechanics, features.contact.shape, setup.head.alive
-    missed = random.random(shape) < config.missed
-    spurious = ~features.contact & (random.random(shape) < config.spurious)
-    anywhere = random.random(shape) * np.radians(setup.whisking.amplitude_deg)
-    noise = config.noise * random.standard_normal((2, *shape))
-    noise = noise * np.array([1.0, MEAN_NOISE_SHARE])[:, None, None]
-    smeared = config.reach_noise * random.standard_normal(shape)
-    contact = ((features.contact & ~missed) | spurious) & alive
-    touched = np.where(spurious, anywhere, features.touched)
-    highest = np.where(spurious, anywhere, features.highest + noise[1])
-    return WhiskColumns(
-        contact=contact,
-        touched=np.where(contact, touched + noise[0], 0.0),
-        held=((features.held & ~missed) | spurious) & alive,
-        highest=np.where(alive, highest, 0.0),
-        reach=np.where(contact, np.clip(features.reach + smeared, 0.0, 1.0), 0.0),
-    )

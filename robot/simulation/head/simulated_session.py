@@ -123,8 +123,9 @@ def _systems(setup: HeadSetup, model: Beam) -> tuple[np.ndarray, np.ndarray]:
     servo = mechanics.servo * model.unit
     lengths, which = np.unique(head.length, return_inverse=True)
     steps, pushes = [], []
-    for length in lengths:
-        unit = config.beam.time_unit(float(length))
+    beam = config.beam
+    for length in lengths.tolist():
+        unit = float(length**2 * 2 / beam.radius * np.sqrt(beam.density / beam.modulus))  # of time, s
         sample = 1 / (config.rate * unit)
         rotor = servo / (2 * np.pi * config.servo.frequency * unit) ** 2
         mass = np.zeros((3, 3))
@@ -135,7 +136,7 @@ def _systems(setup: HeadSetup, model: Beam) -> tuple[np.ndarray, np.ndarray]:
         spring, damper = np.zeros((3, 3)), np.zeros((3, 3))
         spring[0, 0], damper[0, 0] = servo, drag
         spring[1:, 1:] = model.stiffness
-        damper[1:, 1:] = 2 * config.beam.damping / model.modes[0] * model.stiffness
+        damper[1:, 1:] = 2 * beam.damping / model.modes[0] * model.stiffness
         inverse = np.linalg.inv(mass)
         flow = np.zeros((11, 11))  # six states, command, its rate, three forces
         flow[:3, 3:6] = sample * np.eye(3)
@@ -229,7 +230,10 @@ class HeadSimulation(SimulatedSource):
         self.config, self.head_config = config, head_config
         self.tier, self.tier_reason = choose_tier(config)
         self.head = head = ur10_head(head_config)
+        self.whiskers, self.view_shape = len(head.length), (*head.shape, 1)
         whisking, seed = config.whisking, config.seed
+        self.rate_hz = whisking.rate
+        self._setup = HeadSetup(head, config.stream, config.mechanics, whisking)
         check_amplitude(whisking, head)
         self.scene = make_scene(config.maze, config.path, config.motion, config.kidnaps, head, seed)
         check_steps("simulation", min(self.scene.duration, self.scene.path.duration) * whisking.rate)
@@ -285,29 +289,10 @@ class HeadSimulation(SimulatedSource):
             provenance={"simulation": plain},
         )
 
-    @property
-    def _setup(self) -> HeadSetup:
-        return HeadSetup(self.head, self.config.stream, self.config.mechanics, self.config.whisking)
-
-    @property
-    def rate_hz(self) -> float:
-        return self.config.whisking.rate
-
-    @property
-    def view_shape(self) -> tuple[int, int, int]:
-        return (*self.head.shape, 1)
-
-    @property
-    def whiskers(self) -> int:
-        return len(self.head.length)
-
     def _readings(self) -> Iterator[Whisk | Cycle]:
-        if self.features is None:
-            return self._cycles()
-        return (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in zip(*self.features, strict=True))
-
-    def _cycles(self) -> Iterator[Cycle]:
-        """Raw samples of each cycle, without odometry."""
+        if self.features is not None:
+            yield from (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in zip(*self.features, strict=True))
+            return
         assert self.calibration is not None
         random, baseline = stream(self.config.seed, "sensor"), deepcopy(self._baseline)
         model, threshold = RAW_TIERS[self.tier], self.calibration.threshold[:, 1]

@@ -11,7 +11,7 @@ whisker bent beyond the limit slips off until the cycle ends.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,14 +45,9 @@ class WallSweep(NamedTuple):
     noise: np.ndarray
 
 
-class MechanicsModel(Protocol):
-    """A model of the mechanics."""
-
-    def __call__(
-        self, setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """True angle, x and y of every sample, [T, N, W] rad; the whisking law reads y with noise."""
-        ...
+MechanicsModel = Callable[[HeadSetup, WallSweep, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""A model of the mechanics: true angle, x and y of every sample, [T, N, W] rad, of a sweep, with contact
+thresholds [W] of y, rad. Its whisking law reads y with noise."""
 
 
 def simulate_cycles(
@@ -71,15 +66,12 @@ def simulate_cycles(
         threshold: [W] contact threshold of y from a calibration, rad. baseline: coloured noise, drift and
             creep of the deflections, which go on from its state; None: none.
     """
-    config, whisking = setup.config, setup.whisking
-    knots = np.linspace(0.0, 1 / whisking.rate, config.poses + 1)
-    time = _times(setup)
-    for k in range(0, len(start), config.batch):
-        some = start[k : k + config.batch]
-        pose = poses_at(path, some[:, None] + knots)
-        noise = draw_noise(setup.mechanics, _shape(setup, len(some)), random, baseline)
-        sweep = sweep_walls(surroundings, pose, knots, time, noise)
-        yield from _run(tier, setup, sweep, threshold, some, baseline)
+    knots = np.linspace(0.0, 1 / setup.whisking.rate, setup.config.poses + 1)
+
+    def sweep(begins: np.ndarray, time: np.ndarray, noise: np.ndarray) -> WallSweep:
+        return sweep_walls(surroundings, poses_at(path, begins[:, None] + knots), knots, time, noise)
+
+    return _simulate(tier, setup, sweep, start, random, threshold, baseline)
 
 
 def simulate_free_cycles(
@@ -95,40 +87,33 @@ def simulate_free_cycles(
         baseline: as in `simulate_cycles`.
     """
     setup = setup._replace(whisking=setup.whisking.model_copy(update={"mode": "open"}))
-    start, time = np.arange(count) / setup.whisking.rate, _times(setup)
-    threshold = np.full(len(setup.head.length), np.inf)
-    record: list[Cycle] = []
-    for k in range(0, count, setup.config.batch):
-        some = start[k : k + setup.config.batch]
-        nothing = np.zeros((len(time), len(some), len(setup.head.length)))
-        noise = draw_noise(setup.mechanics, _shape(setup, len(some)), random, baseline)
-        sweep = WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, noise)
-        record += _run(tier, setup, sweep, threshold, some, baseline)
-    return record
+    start, threshold = np.arange(count) / setup.whisking.rate, np.full(len(setup.head.length), np.inf)
+
+    def sweep(begins: np.ndarray, time: np.ndarray, noise: np.ndarray) -> WallSweep:
+        return sweep_air(time, noise)
+
+    return list(_simulate(tier, setup, sweep, start, random, threshold, baseline))
 
 
-def _run(
+def _simulate(
     tier: MechanicsModel,
     setup: HeadSetup,
-    sweep: WallSweep,
-    threshold: np.ndarray,
+    sweep: Callable[[np.ndarray, np.ndarray, np.ndarray], WallSweep],
     start: np.ndarray,
+    random: np.random.Generator,
+    threshold: np.ndarray,
     baseline: Baseline | None,
 ) -> Iterator[Cycle]:
-    truth = tier(setup, sweep, threshold)
-    angle, deflection = sensor_readings(setup.config, setup.head, truth, sweep.noise, baseline)
-    for k in range(len(start)):
-        yield Cycle(start[k] + sweep.time, angle[k], deflection[k], NO_ODOMETRY)
-
-
-def _times(setup: HeadSetup) -> np.ndarray:
-    """Sample times [T] of a cycle, s."""
-    return np.arange(round(setup.config.rate / setup.whisking.rate)) / setup.config.rate
-
-
-def _shape(setup: HeadSetup, cycles: int) -> tuple[int, int, int]:
-    """Numbers of cycles, of samples of a cycle and of whiskers."""
-    return cycles, len(_times(setup)), len(setup.head.length)
+    """Cycles that start at times [N] s, batch by batch; `sweep` takes starts, sample times and noise."""
+    head, config, mechanics, whisking = setup
+    time = np.arange(round(config.rate / whisking.rate)) / config.rate
+    for k in range(0, len(start), config.batch):
+        begins = start[k : k + config.batch]
+        noise = draw_noise(mechanics, (len(begins), len(time), len(head.length)), random, baseline)
+        truth = tier(setup, sweep(begins, time, noise), threshold)
+        samples = sensor_readings(config, head, truth, noise, baseline)
+        for begin, angle, deflection in zip(begins, *samples, strict=True):
+            yield Cycle(begin + time, angle, deflection, NO_ODOMETRY)
 
 
 def draw_noise(
@@ -168,6 +153,12 @@ def sensor_readings(
     return seen[..., 0], np.clip(seen[..., 1:], -config.full_scale, config.full_scale)
 
 
+def sweep_air(time: np.ndarray, noise: np.ndarray) -> WallSweep:
+    """Sweeps [N, T, W, 3] without walls: sample times [T] s, noise rad."""
+    nothing = np.zeros(noise.shape[:3]).swapaxes(0, 1)
+    return WallSweep(time, nothing + NO_CONTACT, nothing + 1.0, nothing, noise)
+
+
 def sweep_walls(
     surroundings: Surroundings, pose: np.ndarray, knots: np.ndarray, time: np.ndarray, noise: np.ndarray
 ) -> WallSweep:
@@ -187,7 +178,14 @@ def sweep_walls(
     share = ((time - knots[place]) / step)[:, None, None]
     same = (box[:-1] == box[1:]) & (box[1:] >= 0)
     share = np.where(same[place], share, np.round(share))
-    drift = _drift(head, pose, step, wall, reach)
+    # Sideways angular speed [K, N, W] of the walls.
+    motion = between(pose[:, :-1].reshape(-1, 3), pose[:, 1:].reshape(-1, 3)).reshape(*pose[:, 1:].shape)
+    speed, outwards = motion.swapaxes(0, 1)[:, :, None] / step, surroundings.outwards
+    opening = surroundings.opening - np.where(wall < NO_CONTACT, wall, 0.0)
+    arm = np.maximum(reach, 0.05) * head.length
+    out = surroundings.radius + arm * np.sin(opening)
+    sideways = speed[..., 1] * outwards[:, 0] - speed[..., 0] * outwards[:, 1] + speed[..., 2] * out[:-1]
+    drift = -sideways / arm[:-1]
     with np.errstate(invalid="ignore"):
         mixed = wall[place] + share * (wall[place + 1] - wall[place])
     return WallSweep(
@@ -197,19 +195,6 @@ def sweep_walls(
         drift=drift[place],
         noise=noise,
     )
-
-
-def _drift(head: Head, pose: np.ndarray, step: float, wall: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Sideways angular speed [K, N, W] of walls between successive poses, rad/s."""
-    motion = between(pose[:, :-1].reshape(-1, 3), pose[:, 1:].reshape(-1, 3)).reshape(*pose[:, 1:].shape)
-    speed = motion.swapaxes(0, 1)[:, :, None] / step
-    outwards = head.rest[:, :2] / np.linalg.norm(head.rest[:, :2], axis=1, keepdims=True)
-    opening = np.arctan2(np.hypot(*head.rest[:, :2].T), -head.rest[:, 2])
-    opening = opening - np.where(wall < NO_CONTACT, wall, 0.0)
-    arm = np.maximum(reach, 0.05) * head.length
-    out = np.hypot(*head.base[:, :2].T) + arm * np.sin(opening)
-    sideways = speed[..., 1] * outwards[:, 0] - speed[..., 0] * outwards[:, 1] + speed[..., 2] * out[:-1]
-    return -sideways / arm[:-1]
 
 
 WhiskingLaw = Callable[[WhiskDrive, float, np.ndarray], tuple[np.ndarray, WhiskDrive]]

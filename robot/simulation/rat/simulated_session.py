@@ -255,7 +255,7 @@ class RatSimulation(SimulatedSource):
     whiskers = 0
 
     def __init__(self, config: RatSimulationConfig, path: RatPath | None = None) -> None:
-        self.config = config
+        self.config, self.rate_hz = config, config.rate_hz
         self.view_shape = (1, config.views.columns, 1)
         pose = _poses_of(config, path)
         rows = len(pose)
@@ -278,13 +278,21 @@ class RatSimulation(SimulatedSource):
         self.odometry = measure_motion(config.odometry, motion, config.seed)
         # The timeline has the numbers of these boxes.
         self._boxes = [config.box, *(phase.box for phase in config.phases if phase.box is not None)]
-        self.info = _describe(config, self._boxes)
+        sizes = [(box.width, box.height) for box in self._boxes]
+        sizes += [
+            (config.box.width * phase.stretch[0], config.box.height * phase.stretch[1])
+            for phase in config.phases
+            if phase.stretch is not None
+        ]
+        width, height = np.max(sizes, axis=0).tolist()
+        settings = config.model_dump(mode="json", exclude={"path": {"file"}})
+        self.info = SourceInfo(
+            cell_size=round(ROOM * max(width, height) / CELLS, 6),
+            box=(0.0, 0.0, width, height),
+            provenance={"rat_simulation": settings},
+        )
         document = digest_of_document(self.info.provenance)
         self.digest = digest_of([document.encode(), np.ascontiguousarray(pose).tobytes()])
-
-    @property
-    def rate_hz(self) -> float:
-        return self.config.rate_hz
 
     def views(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows [V] with a view, and these views [V, 1, C, 1]. Darkness has none."""
@@ -347,19 +355,3 @@ def _enter_box(path: RatPath, size: tuple[float, float], where: str) -> RatPath:
         found = f"{len(far)} positions up to {beyond.max():.3g} m outside, the first ({x:.3g}, {y:.3g}) at "
         raise InputError(where, f"{found}{path.time[far[0]]:.6g} s", box, cure)
     return path._replace(position=inside)
-
-
-def _describe(config: RatSimulationConfig, boxes: list[BoxConfig]) -> SourceInfo:
-    sizes = [(box.width, box.height) for box in boxes]
-    sizes += [
-        (config.box.width * phase.stretch[0], config.box.height * phase.stretch[1])
-        for phase in config.phases
-        if phase.stretch is not None
-    ]
-    width, height = np.max(sizes, axis=0).tolist()
-    settings = config.model_dump(mode="json", exclude={"path": {"file"}})
-    return SourceInfo(
-        cell_size=round(ROOM * max(width, height) / CELLS, 6),
-        box=(0.0, 0.0, width, height),
-        provenance={"rat_simulation": settings},
-    )

@@ -11,7 +11,7 @@ import pytest
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.processes import WINDOW, LatenessMeter
 from robot.drivers.ur10.driver_config import ArmConfig
-from robot.drivers.ur10.safety import ended_script_finding, silent_session_finding, stale_finding
+from robot.drivers.ur10.safety import ended_script_finding, stale_finding
 
 REAL = ArmConfig(host="192.168.1.10")
 PRIORITIES = """
@@ -75,12 +75,6 @@ def test_a_control_script_that_ended(
     assert finding.outcome is outcome
     assert ("was not reset for 0.130 s" in finding.detail) == (unreset > 0.1)
     assert ("this machine was" in finding.detail) == (outcome is SessionOutcome.HOST_LATE)
-
-
-def test_a_silent_session_names_this_machine() -> None:
-    finding = silent_session_finding(0.1512)
-    assert finding.outcome is SessionOutcome.HOST_LATE
-    assert "this machine was 0.151 s late" in finding.detail
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no scheduling policies")

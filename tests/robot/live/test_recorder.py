@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames, FrameWindow, assemble_cycle, empty_frames
+from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames, FrameWindow, assemble_cycle
 from robot.drivers.ur10.shared_state import ARM_STATE
 from robot.live.recorder import LiveRecorder
 from robot.recordings.cdr import TRUTH, Event, decode, encode
@@ -119,7 +119,7 @@ def test_the_order_of_frames_does_not_matter(tmp_path_factory: Any, data: st.Dat
 def test_blocks_round_trip(count: int, seed: int, first: int) -> None:
     frames, states = some_frames(count, seed, first), some_states(count + 1, seed)
     assert same_bits(back(frames), (3.5, frames))
-    assert encode(empty_frames(W), (2, 2, 1), W, 3.5) == encode(rows(frames, slice(0)), (2, 2, 1), W, 3.5)
+    assert encode(Frames.blank(W), (2, 2, 1), W, 3.5) == encode(rows(frames, slice(0)), (2, 2, 1), W, 3.5)
     at, again = back(states)
     assert at == states["host"][-1]
     assert again.dtype == ARM_STATE
@@ -211,7 +211,7 @@ def test_a_cut_without_its_frames_is_an_error(tmp_path: Path, monkeypatch: pytes
 
 
 def test_the_frame_window_agrees_with_the_ring_buffer() -> None:
-    window = FrameWindow(empty_frames(W))
+    window = FrameWindow(W)
     assert len(window.between(0, 10**9).sequence) == 0
     block = some_frames(1000)
     for k in range(100):
@@ -277,9 +277,9 @@ def test_rosbags_reads_a_live_recording(tmp_path: Path) -> None:
 
 def test_an_unseen_cut_needs_no_frames(tmp_path: Path, refused: Callable[..., InputError]) -> None:
     with open_recorder(tmp_path / "a.mcap") as recorder:
-        cut = Cut.of(0, START, START, empty_frames(W), motion_of_whisk(0))
+        cut = Cut.of(0, START, START, Frames.blank(W), motion_of_whisk(0))
         assert not cut.seen
-        recorder.add_whisk(cut, empty_frames(W))
+        recorder.add_whisk(cut, Frames.blank(W))
     (sample,) = Recording(tmp_path / "a.mcap")
     assert isinstance(sample.reading, Cycle)
     assert len(sample.reading.time) == 0

@@ -186,8 +186,8 @@ def test_a_late_reply_loses_nothing(fates: list[str], forward: float) -> None:
         loop.poll()
     total = loop.take_odometry()
     assert abs(1000 * (total.dx - line.robot.base.travelled)) < 1 + 1e-6
-    assert loop.counts.stray == 0
-    assert loop.counts.lost == loop.counts.late
+    assert loop.link.counts.stray == 0
+    assert loop.link.counts.lost == loop.link.counts.late
     assert not loop.gap()
 
 
@@ -210,16 +210,16 @@ def test_garbage_costs_only_the_replies_that_it_damages(
     line.mangle = mangle
     spoilt, steps = 0.0, []
     while pending:
-        before, lost = line.robot.base.travelled, loop.counts.lost
+        before, lost = line.robot.base.travelled, loop.link.counts.lost
         drive(line, loop, PERIOD, forward)
         steps.append(abs(line.robot.base.travelled - before))
-        if loop.counts.lost > lost:  # it covered the time since the previous reading
+        if loop.link.counts.lost > lost:  # it covered the time since the previous reading
             spoilt += sum(steps[-2:])
         pending.pop(0)
     loop.poll()
     missing = line.robot.base.travelled - loop.take_odometry().dx
     assert abs(missing) <= spoilt + 1e-3 + 1e-9
-    assert loop.gap() == (loop.counts.lost > 0)
+    assert loop.gap() == (loop.link.counts.lost > 0)
     assert math.copysign(1, missing) == math.copysign(1, forward) or abs(missing) <= 1e-3 + 1e-9
 
 
@@ -233,7 +233,7 @@ def test_garbage_before_a_reply_costs_nothing(count: int, noise: bytes, forward:
     drive(line, loop, 0.1, 0.0)
     assert loop.active_stop is None
     assert not loop.gap()
-    assert loop.counts.stray == count * loop.counts.good - count  # the first reply is undisturbed
+    assert loop.link.counts.stray == count * loop.link.counts.good - count  # the first reply is undisturbed
     assert abs(1000 * (loop.take_odometry().dx - line.robot.base.travelled)) < 1 + 1e-6
 
 

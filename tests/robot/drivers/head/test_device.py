@@ -9,7 +9,7 @@ from array import array
 
 import pytest
 
-from robot.drivers.head.device import Disconnected, HeadIdentity, Stalled, UsbBridge, open_bridge
+from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled, open_bridge
 from robot.drivers.head.driver_config import Address, HeadLinkConfig
 from robot.drivers.head.usb_protocol import ENDPOINT_IN, ENDPOINT_OUT, REQUEST_IN, REQUEST_OUT, Request
 from tactile.base.errors import InputError
@@ -65,7 +65,7 @@ def device(monkeypatch):
 
 @pytest.fixture
 def bridge(device):
-    return UsbBridge(device, "usb:here")
+    return Bridge(device, "usb:here")
 
 
 def test_transfers(device, bridge):
@@ -82,10 +82,10 @@ def test_transfers(device, bridge):
 
 
 def test_a_configured_device_is_not_configured_again(device):
-    UsbBridge(device, "here")
+    Bridge(device, "here")
     assert device.calls == []
     device.configured = False
-    UsbBridge(device, "here")
+    Bridge(device, "here")
     assert device.calls == [("configuration",)]
 
 

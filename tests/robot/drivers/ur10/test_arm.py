@@ -185,13 +185,13 @@ def test_the_program_is_ended_on_the_controller(arm: Arm, controller: Faults) ->
 @pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGKILL])
 def test_the_rtde_process_ends(arm: Arm, controller: Faults, number: int) -> None:
     start_move(arm, controller)
-    os.kill(arm.pid, number)
+    os.kill(arm.process.pid, number)
     assert check_stop(arm, controller) is SessionOutcome.ARM_GONE
 
 
 def test_the_rtde_process_hangs(alert_arm: Arm, controller: Faults) -> None:
     start_move(alert_arm, controller)
-    os.kill(alert_arm.pid, signal.SIGSTOP)
+    os.kill(alert_arm.process.pid, signal.SIGSTOP)
     assert check_stop(alert_arm, controller) is SessionOutcome.ARM_STALE
 
 
@@ -200,12 +200,12 @@ def test_a_stop_without_effect_is_repeated_by_the_dashboard(controller: Faults) 
         arm.start()
         start_move(arm, controller)
         ends = controller.state()["program_stops"]
-        os.kill(arm.pid, signal.SIGSTOP)
+        os.kill(arm.process.pid, signal.SIGSTOP)
         arm.halt()
         until(lambda: not controller.state()["moving"], "a standstill")
         assert controller.state()["program_stops"] > ends
         assert controller.state()["tcp"][0] < AWAY[0] - 1e-3
-        os.kill(arm.pid, signal.SIGKILL)
+        os.kill(arm.process.pid, signal.SIGKILL)
 
 
 def test_a_target_without_joint_solution(arm: Arm, controller: Faults) -> None:

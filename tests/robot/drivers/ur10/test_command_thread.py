@@ -163,7 +163,7 @@ def stub_arm() -> Iterator[tuple[Arm, Link]]:
     with Arm(CONFIG) as arm:
         link = Link()
         arm.shared.publish(a_state())
-        arm.supervisor.process, arm.supervisor.armed = link, True  # type: ignore[assignment]
+        arm.process, arm.armed = link, True  # type: ignore[assignment]
         yield arm, link
 
 

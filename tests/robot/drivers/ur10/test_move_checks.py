@@ -54,7 +54,7 @@ def test_the_rtde_process_checks_every_command(arm: Arm, controller: Faults) -> 
     first = len(controller.state()["targets"])
     here = controller.state()["tcp"]
     stops = int(arm.shared.control["stops"])
-    process = arm.supervisor.process
+    process = arm.process
     assert process is not None
     for number, target in enumerate(([math.nan] * 6, [9.0, *here[1:]], here[:5], [*here[:3], 0.0, 0.0, 0.0])):
         process.send(do="move", number=number, target=target, speed=0.01, stops=stops)
@@ -63,4 +63,4 @@ def test_the_rtde_process_checks_every_command(arm: Arm, controller: Faults) -> 
     assert "refused" in arm.fault.detail
     assert moves(controller, first) == []
     assert controller.state()["tcp"] == here
-    os.kill(arm.pid, 0)
+    os.kill(arm.process.pid, 0)

@@ -20,7 +20,7 @@ from tests.robot.drivers.ur10.conftest import settings
 arm = Arm(settings(sys.argv[1], heartbeat=1.0, watchdog_hz=2.0))
 arm.start()
 arm.move([float(number) for number in sys.argv[2:]])
-print(arm.pid, flush=True)
+print(arm.process.pid, flush=True)
 time.sleep(600)
 """
 

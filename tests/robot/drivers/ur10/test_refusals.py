@@ -105,7 +105,7 @@ def check_refusal(controller: Faults, **others: Any) -> StartupRefused:
     with Arm(settings(controller.host, **others)) as arm:
         with pytest.raises(StartupRefused) as refusal:
             arm.start()
-        assert arm.pid is None
+        assert arm.process is None
         assert arm.fault is None
     assert moves(controller, before) == []
     np.testing.assert_array_equal(controller.state()["tcp"], HOME)

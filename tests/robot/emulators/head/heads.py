@@ -20,7 +20,7 @@ from robot.drivers.head.usb_protocol import (
 )
 from robot.emulators.head.emulated_device import EmulatedHead
 from robot.emulators.head.emulator_config import CONTROL_PORT, HeadEmulatorConfig
-from robot.emulators.head.whiskers import BLOCK, AlongPath, PoseSource, maze_whiskers
+from robot.emulators.head.whiskers import BLOCK, AlongPath, PoseSource, Whiskers
 from robot.world.scene import KidnapConfig, Scene, make_scene
 from robot.world.walls import Walls
 from tactile.whisker_geometry import ur10_head
@@ -54,7 +54,7 @@ class HostedHead:
     ) -> None:
         self.config = HeadEmulatorConfig() if config is None else config
         here = AlongPath(world(self.config).path._replace(time=np.zeros(1), pose=np.zeros((1, 3))))
-        self.whiskers = maze_whiskers(self.config, walls, here if place is None else place)
+        self.whiskers = Whiskers(self.config, walls, here if place is None else place)
         self.bridge = EmulatedHead(self.config, self.whiskers, 0.0)
         self.decoder, self.now = Decoder(self.whiskers.count, 3), 0.0
 

@@ -36,7 +36,7 @@ def test_frames_are_sent_lost_or_waiting(capacity: int, steps: list[tuple[str, i
     for step, count in steps:
         if step == "push":
             frames = [bytes([k % 256]) * 32 for k in range(made, made + count)]
-            held += b"".join(frames[: fifo.room])
+            held += b"".join(frames[: capacity - len(fifo)])
             lost = fifo.lost
             fifo.push(frames)
             made += count

@@ -14,12 +14,9 @@ from robot.simulation.create.state_machine import (
     MachineState,
     TurnConfig,
     WheelCommand,
-    draw_turn,
     drive,
-    early_end,
     motion_end,
     next_state,
-    planned_end,
     wheel_command,
 )
 from tactile.base.random_streams import stream
@@ -37,8 +34,8 @@ def quiet() -> np.ndarray:
 
 def end_of(
     state: CreateState, strain: np.ndarray, bumped: int = ROWS, before: np.ndarray = NONE
-) -> tuple[int, StepEnd]:
-    return motion_end(CONFIG, state, strain, np.arange(ROWS) >= bumped, before)
+) -> tuple[int, StepEnd] | None:
+    return motion_end(CONFIG, state, strain, np.arange(ROWS) >= bumped, before, ROWS - 1)
 
 
 @pytest.mark.parametrize(
@@ -96,8 +93,9 @@ def test_speeds_and_durations_are_those_of_the_paper() -> None:
 
 
 def draw_turns(**changes: object) -> np.ndarray:
-    config, random = TurnConfig.model_validate(changes), stream(1, "behaviour")
-    return np.array([draw_turn(config, random) for _ in range(4000)])
+    config, random = BehaviourConfig(turn=TurnConfig.model_validate(changes)), stream(1, "behaviour")
+    back = MachineState(CreateState.BACK)
+    return np.array([next_state(config, back, StepEnd.FREE, 0.0, random).rest for _ in range(4000)])
 
 
 def test_turns_are_drawn_from_the_two_gaussians() -> None:
@@ -202,8 +200,7 @@ def test_a_motion_ends_at_the_same_row_when_its_rows_come_one_by_one(
     strain[since:, :3] = np.array(levels[:3])[:, None]
     strain[(since + ROWS) // 2 :, :3] = np.array(levels[3:])[:, None]
     body = np.arange(ROWS) >= bumped
-    ends = (
-        early_end(CONFIG, state, strain[:rows], body[:rows], NONE, ROWS - 1) for rows in range(1, ROWS + 1)
-    )
-    found = next((end for end in ends if end is not None), planned_end(state, ROWS - 1))
-    assert found == motion_end(CONFIG, state, strain, body, NONE)
+    ends = [
+        motion_end(CONFIG, state, strain[:rows], body[:rows], NONE, ROWS - 1) for rows in range(1, ROWS + 1)
+    ]
+    assert next(filter(None, ends)) == ends[-1]

@@ -10,14 +10,11 @@ from pydantic import ValidationError
 
 from robot.simulation.create.strain_sensors import (
     Bending,
-    Shaft,
+    FixedWhiskers,
     ShakeConfig,
     WhiskersConfig,
-    base_strain,
     base_strains,
-    bend_shafts,
     bend_whiskers,
-    body_vibration,
     fixed_whiskers,
     sample_strain,
     shaft_tilt,
@@ -30,7 +27,7 @@ from tactile.contact_threshold import ShaftConfig, stiffness
 SEEDS = st.integers(0, 10**6)
 CONFIG = WhiskersConfig()
 FAN = fixed_whiskers(CONFIG)
-LENGTH = FAN.shaft.length
+LENGTH = FAN.length
 FREE = np.zeros(4, int)
 
 
@@ -40,6 +37,10 @@ def arena_and_poses(seed: int) -> tuple[Arena, np.ndarray]:
     poses = random.uniform([0, 0, -np.pi], [1.25, 1.25, np.pi], (4000, 3))
     near = segment_distance(wall_segments(room), poses[:, :2]).min(axis=1) < 0.25
     return room, poses[near & room.has_clearance(poses[:, :2], 0.17)][:50]
+
+
+ONE = FAN._replace(base=np.zeros((1, 2)), direction=np.zeros(1))
+"""A whisker ahead, at the origin of the body."""
 
 
 def each(poses: np.ndarray, walls: np.ndarray) -> Bending:
@@ -101,7 +102,7 @@ def test_a_whisker_turns_by_the_smallest_free_angle(seed: int) -> None:
 
 def flat(bend: Bending) -> np.ndarray:
     """Whiskers whose shaft lies along a wall or a corner."""
-    return np.isclose((shaft_tilt(FAN.shaft, bend.reach) - 1) * np.abs(bend.turn), bend.lean, atol=1e-6)
+    return np.isclose((shaft_tilt(FAN, bend.reach) - 1) * np.abs(bend.turn), bend.lean, atol=1e-6)
 
 
 @settings(max_examples=15)
@@ -146,13 +147,11 @@ def test_a_motion_may_be_computed_in_parts(seed: int, cut: int) -> None:
 
 def test_a_whisker_stays_on_its_side() -> None:
     """A wall first straight across, then tilted to the other side."""
-    base, direction = np.zeros((40, 1, 2)), np.zeros((40, 1))
     tips = np.radians(np.linspace(85, 95, 40))
     turns = [
-        bend_shafts(
-            FAN.shaft,
-            base[:1],
-            direction[:1],
+        bend_whiskers(
+            ONE,
+            np.zeros((1, 3)),
             np.array([[0.13 - np.cos(a), -np.sin(a), 0.13 + np.cos(a), np.sin(a)]]),
             np.array([side]),
         ).turn[0, 0]
@@ -163,16 +162,16 @@ def test_a_whisker_stays_on_its_side() -> None:
     assert (np.array(turns[40:]) < 0).all()
     # Turned on the spot before one wall, from one side of the perpendicular to the other.
     wall = np.array([[0.13, -1.0, 0.13, 1.0]])
-    bend = bend_shafts(FAN.shaft, base, np.linspace(0.1, -0.1, 40)[:, None], wall, np.zeros(1, int))
-    assert (bend.side == 1).all()
-    assert bend_shafts(FAN.shaft, base[:1], -np.full((1, 1), 0.1), wall, np.zeros(1, int)).side[0, 0] == -1
+    turned = np.column_stack([np.zeros((40, 2)), np.linspace(0.1, -0.1, 40)])
+    assert (bend_whiskers(ONE, turned, wall, np.zeros(1, int)).side == 1).all()
+    assert bend_whiskers(ONE, turned[-1:], wall, np.zeros(1, int)).side[0, 0] == -1
 
 
 def test_contact_with_a_tip_a_shaft_and_a_corner() -> None:
     wall = np.array([[-1.0, 0.0, 1.0, 0.0]])
     height = np.linspace(0.0999, 0.02, 400)  # of the base above the wall, seen at 45 degrees
-    base = np.stack([np.zeros(400), height], axis=1)[:, None]
-    bend = bend_shafts(FAN.shaft, base, np.full((400, 1), -np.pi / 4), wall, np.zeros(1, int))
+    poses = np.column_stack([np.zeros(400), height, np.full(400, -np.pi / 4)])
+    bend = bend_whiskers(ONE, poses, wall, np.zeros(1, int))
     turn, reach = bend.turn[:, 0], bend.reach[:, 0]
     touching = turn != 0
     assert touching.argmax() > 0
@@ -186,14 +185,12 @@ def test_contact_with_a_tip_a_shaft_and_a_corner() -> None:
     assert (np.diff(reach[lies]) < 0).all()
     assert np.abs(np.diff(reach)).max() < 3e-3  # without jumps
     # A whisker along the wall has the wall's direction.
-    assert np.allclose(turn[lies] * shaft_tilt(FAN.shaft, reach[lies]), np.pi / 4)
+    assert np.allclose(turn[lies] * shaft_tilt(FAN, reach[lies]), np.pi / 4)
 
     # Swept past the corner of an object: the bend grows, then the whisker is free at once.
     sides = polygon_edges(square(np.array([0.12, 0.1]), 0.2, np.pi / 4))
-    sweep = np.linspace(-0.7, 0.7, 400)
-    bend = bend_shafts(
-        FAN.shaft, np.zeros((400, 1, 2)), sweep[:, None], sides + [0.09, -0.1] * 2, np.zeros(1, int)
-    )
+    sweep = np.column_stack([np.zeros((400, 2)), np.linspace(-0.7, 0.7, 400)])
+    bend = bend_whiskers(ONE, sweep, sides + [0.09, -0.1] * 2, np.zeros(1, int))
     turn, reach = bend.turn[:, 0], bend.reach[:, 0]
     held = turn != 0
     assert held.any()
@@ -215,10 +212,16 @@ def test_a_wall_out_of_reach_bends_no_whisker() -> None:
         assert (one == other).all()
 
 
+def strain_at(shaft: FixedWhiskers, turn: float, reach: float) -> float:
+    """Horizontal strain of a whisker that is turned by an angle by a contact at a distance from its base."""
+    bent = Bending(*(np.full((1, 1), value) for value in (turn, reach, 0.0, 1)))
+    return float(base_strains(CONFIG, shaft._replace(alive=np.ones(1, bool)), bent)[0, 0, 0])
+
+
 @given(st.floats(0.02, 0.139), st.floats(0.2, 1.0))
 def test_moments_are_those_of_a_tapered_beam(reach: float, taper: float) -> None:
     """Compared with the integrated curvature of a cone under a point force."""
-    shaft = Shaft(0.14, 0.7e-3, (1 - taper) / 0.14)
+    shaft = FAN._replace(radius=0.7e-3, taper=(1 - taper) / LENGTH)
     x = np.linspace(0, reach, 4001)
     curvature = (reach - x) / (1 - shaft.taper * x) ** 4  # F / (E I0) = 1
 
@@ -228,16 +231,14 @@ def test_moments_are_those_of_a_tapered_beam(reach: float, taper: float) -> None
     slope = integral(curvature)
     turn = integral(slope)[-1] / reach
     assert shaft_tilt(shaft, np.array(reach)) == pytest.approx(slope[-1] / turn, rel=1e-4)
-    assert base_strain(shaft, np.array(turn), np.array(reach)) == pytest.approx(
-        0.7e-3 * curvature[0], rel=1e-4
-    )
+    assert strain_at(shaft, turn, reach) == pytest.approx(0.7e-3 * curvature[0], rel=1e-4)
 
 
 @given(st.floats(0.1, 1.0))
 def test_wall_estimation_uses_the_same_beam_model(share: float) -> None:
     config = ShaftConfig(taper=0.3 / 1.45)
-    mine = base_strain(FAN.shaft, np.array([1.0, 1.0]), LENGTH * np.array([share, config.reference]))
-    assert mine[0] / mine[1] == pytest.approx(float(stiffness(config, share)))
+    mine, other = (strain_at(FAN, 1.0, LENGTH * place) for place in (share, config.reference))
+    assert mine / other == pytest.approx(float(stiffness(config, share)))
 
 
 def test_horizontal_strain_has_the_side_and_vertical_strain_the_slant() -> None:
@@ -245,9 +246,9 @@ def test_horizontal_strain_has_the_side_and_vertical_strain_the_slant() -> None:
 
     def strains(angle: float) -> np.ndarray:
         """Strain [2] of a whisker at this angle to the wall, with its tip bent aside by 0.1 rad."""
-        base = np.array([[[0.0, LENGTH * np.sin(angle - 0.1)]]])
-        one = bend_shafts(FAN.shaft, base, np.array([[-angle]]), wall, np.zeros(1, int))
-        return base_strains(CONFIG, FAN._replace(alive=np.ones(1, bool)), one)[0, 0]
+        pose = np.array([[0.0, LENGTH * np.sin(angle - 0.1), -angle]])
+        one = bend_whiskers(ONE, pose, wall, np.zeros(1, int))
+        return base_strains(CONFIG, ONE._replace(alive=np.ones(1, bool)), one)[0, 0]
 
     steep, slanting = strains(1.2), strains(0.5)
     assert steep[0] == pytest.approx(slanting[0])
@@ -269,8 +270,12 @@ def test_dead_whiskers_have_no_strain() -> None:
 
 
 def test_body_vibration_has_its_frequency_and_decays() -> None:
-    config = ShakeConfig()
-    shakes = np.array([body_vibration(config, 4000, 2000.0, stream(seed, "strain")) for seed in range(60)])
+    still, config = CONFIG.model_copy(update={"noise": 0.0}), CONFIG.shake
+
+    def shake(rows: int, seed: int) -> np.ndarray:
+        return sample_strain(still, np.zeros((rows, 4, 2)), FAN.alive, stream(seed, "strain"))[:, 0]
+
+    shakes = np.array([shake(4000, seed) for seed in range(60)])
     power = (np.abs(np.fft.rfft(shakes, axis=1)) ** 2).mean(axis=(0, 2))
     frequency = np.fft.rfftfreq(4000, 1 / 2000.0)
     assert abs(frequency[power.argmax()] - config.frequency) < 2
@@ -278,7 +283,7 @@ def test_body_vibration_has_its_frequency_and_decays() -> None:
     late = shakes[:, 2000:].std()
     assert late == pytest.approx(config.rumble, rel=0.1)
     assert shakes[:, :100].std() > 2 * late
-    assert body_vibration(config, 0, 2000.0, stream(0, "strain")).shape == (0, 2)
+    assert shake(0, 0).shape == (0, 2)
 
 
 def test_sensor_noise_has_the_configured_level() -> None:
