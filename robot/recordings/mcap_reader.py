@@ -23,7 +23,7 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata, Schema, Statistics
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from robot.drivers.head.decoder import Frames, FrameWindow, assemble_cycle, empty_frames
+from robot.drivers.head.decoder import Frames, FrameWindow, assemble_cycle
 from robot.recordings.cdr import (
     CUT,
     FRAMES,
@@ -254,7 +254,7 @@ class McapScanner:
             for record in _read_records(file):
                 if isinstance(record, Metadata) and record.name == METADATA and self.description is None:
                     self.description = read_metadata(record.metadata)
-                    self._frames = FrameWindow(empty_frames(self.description.whiskers))
+                    self._frames = FrameWindow(self.description.whiskers)
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
