@@ -17,12 +17,7 @@ import numpy as np
 
 from tactile.base.errors import InputError
 from tactile.base.samples import robust_sd
-from tactile.calibration import (
-    DirtyRecordConfig,
-    calibrate_free,
-    estimate_drift,
-    estimate_noise,
-)
+from tactile.calibration import DirtyRecordConfig, calibrate_free, estimate_drift, estimate_noise
 from tactile.whisker_geometry import HeadConfig
 
 LEAST_CONTACTS = 50

@@ -11,14 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from ratslam.cli.common import (
-    INPUT_ERROR,
-    Commands,
-    add_config,
-    positive_integer,
-    prepare_jax,
-    read_config,
-)
+from ratslam.cli.common import INPUT_ERROR, Commands, add_config, positive_integer, prepare_jax, read_config
 from ratslam.runs.settings.packaged import find_config
 from tactile.base.errors import InputError, tell
 from tactile.base.files import require_new_file, require_own_folder

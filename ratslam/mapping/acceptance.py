@@ -26,12 +26,7 @@ from ratslam.mapping.loop_closures import CONFIRMED_WEIGHT, Candidate, ClosureLo
 from ratslam.mapping.map_solution import MapSolution, cheapest_map, solved_map
 from ratslam.mapping.odometry_scan import OdometryScan
 from ratslam.mapping.optimizer import CalibrationPrior
-from ratslam.mapping.verification import (
-    break_odometry,
-    judge_by_map,
-    map_distance,
-    spans,
-)
+from ratslam.mapping.verification import break_odometry, judge_by_map, map_distance, spans
 
 
 class Acceptance(Checkpointed, ABC):

@@ -16,11 +16,7 @@ from uuid import NAMESPACE_URL, uuid5
 import numpy as np
 
 from evaluation.artifacts.grid_files import read_grid, write_nav2
-from evaluation.cells.analysis import (
-    CellScores,
-    analyse_cells,
-    write_scores,
-)
+from evaluation.cells.analysis import CellScores, analyse_cells, write_scores
 from evaluation.cells.recording import NAME, CellRecording, read_recording
 from ratslam.classic.config import NetworkConfig, network_of
 from ratslam.core.compilation import prepare_precision

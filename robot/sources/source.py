@@ -84,9 +84,7 @@ class SourceInfo(Settings):
     head: HeadConfig | None = None
     """The whisker head."""
     calibration: Annotated[
-        Calibration | None,
-        PlainValidator(_read_calibration),
-        PlainSerializer(lambda c: c and c.to_json()),
+        Calibration | None, PlainValidator(_read_calibration), PlainSerializer(lambda c: c and c.to_json())
     ] = None
     """Free-whisking calibration of the head."""
     planar_whiskers: PlanarWhiskersInfo | None = None

@@ -322,10 +322,7 @@ _Sizes = Mapping[_Network, list[_Sized]]
 
 
 def measure_sizes(
-    task: Task,
-    row: str = "exploration",
-    sides: Sequence[int] = SIDES,
-    sizes: Sequence[float] = SIZES,
+    task: Task, row: str = "exploration", sides: Sequence[int] = SIDES, sizes: Sequence[float] = SIZES
 ) -> _Sizes:
     """The figures of networks of all sides, growing and not, and of all sizes of a cell, growing; each by the
     sessions of its mazes."""

@@ -6,10 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from robot.simulation.create.simulated_session import (
-    CreateSimulationConfig,
-    drive_into_wall,
-)
+from robot.simulation.create.simulated_session import CreateSimulationConfig, drive_into_wall
 from tactile.base.random_streams import stream
 from tactile.base.types import StepEnd
 from tactile.wall_estimation.estimators import WallContact, contact_points, fused_wall

@@ -132,10 +132,7 @@ def choose_rows(names: Sequence[str] | None) -> dict[str, BuildingsRow]:
 
 
 def buildings_table(
-    rows: Mapping[str, BuildingsRow],
-    copies: int = 10,
-    workers: int = 0,
-    files: Files = (None, None),
+    rows: Mapping[str, BuildingsRow], copies: int = 10, workers: int = 0, files: Files = (None, None)
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its runs are done; totals and missing recordings below it.
 

@@ -24,13 +24,7 @@ from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.touch_table import CHANGE, TouchTask, task_config
 from evaluation.papers.trial_sessions import run_session, start_session
 from evaluation.studies.executor import run_tasks
-from ratslam.mapping.closure_judge import (
-    BEYOND,
-    KINDS,
-    WEIGHTS,
-    SequenceEvidence,
-    sequence_evidence,
-)
+from ratslam.mapping.closure_judge import BEYOND, KINDS, WEIGHTS, SequenceEvidence, sequence_evidence
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap

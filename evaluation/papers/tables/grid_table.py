@@ -98,10 +98,7 @@ skill of free space alone, Chamfer map to walls and walls to map, m."""
 
 
 def grid_table(
-    rows: Sequence[tuple[str, str]] = DEFAULT_ROWS,
-    arenas: int = 10,
-    first: int = 9000,
-    workers: int = 0,
+    rows: Sequence[tuple[str, str]] = DEFAULT_ROWS, arenas: int = 10, first: int = 9000, workers: int = 0
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its sessions are done.
 

@@ -96,12 +96,7 @@ def score_contacts(contact: np.ndarray, marks: np.ndarray) -> tuple[float, ...]:
     right = int((contact & marked).sum())
     false, missed, doubtful, silent = (
         int(rows.sum())
-        for rows in (
-            contact & (marks == FREE),
-            ~contact & marked,
-            contact & unclear,
-            ~contact & unclear,
-        )
+        for rows in (contact & (marks == FREE), ~contact & marked, contact & unclear, ~contact & unclear)
     )
     wholes = right + false, right + missed, right + false + doubtful, right + missed + silent
     return (*(right / whole if whole else np.nan for whole in wholes), float(unclear.mean()))

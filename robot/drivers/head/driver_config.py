@@ -7,9 +7,11 @@ from typing import Literal, NamedTuple
 
 from pydantic import PositiveFloat, field_validator
 
-from robot.drivers.head.emulated_cable import PORT
 from robot.drivers.head.usb_protocol import PRODUCT, VENDOR
 from tactile.base.settings import Settings
+
+PORT = 30100
+"""Of an emulated head."""
 
 
 class HeadLinkConfig(Settings):

@@ -26,7 +26,6 @@ from enum import IntEnum
 from types import SimpleNamespace
 from typing import Any, NoReturn, TypeVar
 
-PORT = 30100
 REQUEST, ANSWER = struct.Struct("<BBBxHHII"), struct.Struct("<iI")
 IN = 0x80
 """Bit of an address that marks data to the host."""
@@ -56,7 +55,7 @@ class UsbConnection:
         OSError: ENODEV without a listener, or after the device was unplugged.
     """
 
-    def __init__(self, host: str, port: int = PORT) -> None:
+    def __init__(self, host: str, port: int) -> None:
         self._lock = threading.Lock()
         try:
             self._socket = socket.create_connection((host, port), PATIENCE)
@@ -141,7 +140,7 @@ class _Handle:
 class SocketBackend:
     """A `usb.backend.IBackend` (by its methods) of a bus with at most one device: an emulator's."""
 
-    def __init__(self, host: str, port: int = PORT) -> None:
+    def __init__(self, host: str, port: int) -> None:
         self.host, self.port = host, port
 
     def enumerate_devices(self) -> Iterator[bytes]:

@@ -17,14 +17,7 @@ import numpy as np
 from robot.drivers.head.decoder import Decoder, Frames
 from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled
 from robot.drivers.head.driver_config import HeadLinkConfig
-from robot.drivers.head.usb_protocol import (
-    ANGLE,
-    CHANNELS,
-    KEEP_ALIVE,
-    Command,
-    CommandKind,
-    Request,
-)
+from robot.drivers.head.usb_protocol import ANGLE, CHANNELS, KEEP_ALIVE, Command, CommandKind, Request
 from robot.drivers.outcome import Fault, SessionOutcome
 from tactile.base.errors import InputError
 

@@ -20,13 +20,7 @@ from robot.drivers.head.usb_protocol import (
 )
 from tactile.base.errors import InputError
 from tactile.whisker_geometry import Head
-from tactile.whisking import (
-    WhiskingConfig,
-    check_amplitude,
-    initial_drive,
-    whisk_command,
-    whisk_phase,
-)
+from tactile.whisking import WhiskingConfig, check_amplitude, initial_drive, whisk_command, whisk_phase
 
 WHERE = "live.plan.whisking"
 

@@ -26,12 +26,7 @@ from robot.emulators.head.emulated_device import EmulatedHead
 from robot.emulators.head.server import open_server
 from robot.emulators.head.whiskers import Block, SensorArray, block_samples
 from robot.emulators.listening import answer_fault, do_fault
-from robot.simulation.create.strain_sensors import (
-    BodyVibration,
-    base_strains,
-    bend_whiskers,
-    fixed_whiskers,
-)
+from robot.simulation.create.strain_sensors import BodyVibration, base_strains, bend_whiskers, fixed_whiskers
 from robot.world.arena import make_arena
 from robot.world.walls import segment_distance
 from tactile.base.errors import InputError, os_errors_of

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
-from robot.drivers.head.emulated_cable import PORT
+from robot.drivers.head.driver_config import PORT
 from robot.drivers.ur10.driver_config import BaseTransformConfig
 from robot.simulation.head.beam import StreamConfig
 from robot.simulation.head.kinematic import MechanicsConfig

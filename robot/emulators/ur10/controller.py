@@ -14,14 +14,7 @@ from enum import IntEnum
 from typing import Any
 
 from robot.drivers.ur10.rtde_protocol import OUTPUT_TYPES, REGISTERS
-from robot.emulators.ur10.emulated_arm import (
-    EmulatedArm,
-    MoveL,
-    MoveOrder,
-    StopL,
-    Unreachable,
-    parse_moves,
-)
+from robot.emulators.ur10.emulated_arm import EmulatedArm, MoveL, MoveOrder, StopL, Unreachable, parse_moves
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
 from robot.emulators.ur10.kinematics import Vector6, vector6
 

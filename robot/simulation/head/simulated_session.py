@@ -57,13 +57,7 @@ from tactile.base.types import Cycle, Whisk
 from tactile.calibration import CalibrationConfig, calibrate
 from tactile.contact_threshold import stiffness
 from tactile.whisker_geometry import HeadConfig, ur10_head
-from tactile.whisking import (
-    MID_PROTRACTION,
-    WhiskingConfig,
-    check_amplitude,
-    initial_drive,
-    whisk_command,
-)
+from tactile.whisking import MID_PROTRACTION, WhiskingConfig, check_amplitude, initial_drive, whisk_command
 
 WALL_STIFFNESS = 300.0
 """Ratio of wall stiffness to whisker stiffness."""
