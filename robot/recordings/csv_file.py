@@ -171,13 +171,13 @@ class CsvFile:
         return values if factor == 1 else values / factor, self.fault[:, places]
 
 
-def read_csv(path: Path, clock: str | None = None) -> CsvFile:
+def read_csv(path: Path, clock: str | None = None, names: Sequence[str] = ()) -> CsvFile:
     """Reads a CSV file of numbers; dates become s since 1970 (UTC).
 
     Lines that begin with # or % are comments, but such a line right above numbers may be the header.
 
     Args:
-        clock: unit of times whose header states none.
+        clock: unit of times whose header states none. names: of the columns of a file without a header.
 
     Raises:
         InputError: the file, its header or rows are missing, it is not text, or it exceeds a limit.
@@ -186,7 +186,7 @@ def read_csv(path: Path, clock: str | None = None) -> CsvFile:
     _limit(str(path), path.stat().st_size, 1 << 28, "bytes")
     content = read_bytes(path)
     lines = _lines_of(content, path)
-    line, separator, full = _header(path, lines)
+    line, separator, full = (0, ",", tuple(names)) if names else _header(path, lines)
     rows = [number for number in range(line, len(lines)) if not _is_skipped(lines[number])]
     if not rows:
         raise InputError(str(path), "has no rows under its header", "at least one row")
@@ -201,10 +201,10 @@ def read_csv(path: Path, clock: str | None = None) -> CsvFile:
         values, dates = _cells(text, separator, fault)
     bare, units = zip(*map(split_unit, full), strict=True)
     count = Counter(bare) + Counter(full)
-    names = (
+    plain = tuple(
         short if count[short] == 1 + (short == name) else name for name, short in zip(full, bare, strict=True)
     )
-    return CsvFile(path, line, separator, full, tuple(names), units, values, fault, dates,
+    return CsvFile(path, line, separator, full, plain, units, values, fault, dates,
                    np.array(rows) + 1, content, clock)  # fmt: skip
 
 

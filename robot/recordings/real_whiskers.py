@@ -13,7 +13,7 @@ No file has times of its readings. Each cell of each row of a CSV file must be a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO, StringIO
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 from scipy.io import loadmat
 
+from robot.recordings.csv_file import read_csv
 from robot.recordings.sanity_checks import nonfinite_errors
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors, read_bytes
@@ -32,75 +33,27 @@ from tactile.calibration import DirtyRecordConfig, calibrate_free
 from tactile.contact_stream import ContactStreamConfig, Touch, find_contacts, start_stream
 
 
-def read_columns(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, str]:
-    """The numbers [N, C] below a header of exactly these columns, and sha256 (hex) of the file.
+def read_columns(path: Path, columns: Sequence[str], header: bool = True) -> tuple[np.ndarray, str]:
+    """The numbers [N, C] of a file of exactly these columns, and sha256 (hex) of the file.
+
+    Args:
+        header: whether the first line names the columns.
 
     Raises:
         InputError: the file is missing, empty or cut, or has other columns or cells that are not finite
             numbers.
     """
-    content = read_bytes(path)
-    header, _, rows = _text(path, content).partition("\n")
-    names = header.strip().split(",")
-    if lacking := [name for name in columns if name not in names]:
-        raise missing_error(str(path), "column", lacking[0], names)
-    if names != list(columns):
-        raise InputError(str(path), f"{len(names)} columns", f"these {len(columns)}: {', '.join(columns)}")
-    return _parse(path, rows, columns, first_line=2), digest_of([content])
-
-
-def _read_rows(path: Path, count: int) -> tuple[np.ndarray, str]:
-    """The numbers [N, count] of a file without a header, and sha256 (hex) of the file.
-
-    Raises:
-        InputError: as `read_columns`.
-    """
-    content = read_bytes(path)
-    columns = [f"column {number}" for number in range(1, count + 1)]
-    return _parse(path, _text(path, content), columns, first_line=1), digest_of([content])
-
-
-def _text(path: Path, content: bytes) -> str:
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(str(path), "bytes that are not UTF-8", "a CSV file in UTF-8") from None
-
-
-def _parse(path: Path, rows: str, columns: Sequence[str], first_line: int) -> np.ndarray:
-    expected = f"{len(columns)} numbers in each line"
-    if not rows.strip():
-        raise InputError(str(path), "no rows", expected, "was it copied completely?")
-    if not rows.endswith("\n"):
+    file = read_csv(path, names=() if header else columns)
+    raise_errors(file.absences([(name, "") for name in columns])[:1])
+    if file.full != tuple(columns):
+        expected = f"these {len(columns)}: {', '.join(columns)}"
+        raise InputError(str(path), f"{len(file.full)} columns", expected)
+    if not file.content.endswith(b"\n"):
         raise InputError(str(path), "the last line is cut", cure="copy the file again")
-    try:
-        table = np.loadtxt(StringIO(rows), delimiter=",", comments=None, ndmin=2)
-    except ValueError:
-        table = np.empty((0, 0))
-    if table.shape[1] != len(columns):
-        raise _first_fault(path, rows, columns, first_line)
-    raise_errors(
-        [
-            error
-            for name, column in zip(columns, table.T, strict=True)
-            for error in nonfinite_errors(column, name, lambda row: f"{path}:{row + first_line}")
-        ]
-    )
-    return table
-
-
-def _first_fault(path: Path, rows: str, columns: Sequence[str], first_line: int) -> InputError:
-    """The first line that does not hold the numbers, and what it holds."""
-    for number, line in enumerate(rows.splitlines(), start=first_line):
-        cells, where = line.split(","), f"{path}:{number}"
-        if line.strip() and len(cells) != len(columns):
-            return InputError(where, f"{len(cells)} cells", f"{len(columns)} numbers")
-        for column, cell in zip(columns, cells, strict=False):
-            try:
-                float(cell or "empty")
-            except ValueError:
-                return InputError(where, f"{cell!r} in {column}", "a number")
-    return InputError(str(path), "lines of different lengths", f"{len(columns)} numbers in each line")
+    if file.dates or len(file.lines) != file.content.strip().count(b"\n") + (not header):
+        raise InputError(str(path), "lines without numbers", f"{len(columns)} numbers in each line")
+    raise_errors(file.judge(columns)[1] or nonfinite_errors(file.values, "a number", file.place))
+    return file.values, digest_of([file.content])
 
 
 def _source(
@@ -223,14 +176,6 @@ def open_reach(config: ReachConfig) -> InMemorySource:
 REACH = SourceEntry(ReachConfig, lambda config, warn: open_reach(config))
 
 
-class StageRecording(NamedTuple):
-    """N rows of a file: position [N, 3] of the stage, m; signal [N, 3], counts; sha256 (hex) of the file."""
-
-    position: np.ndarray
-    signal: np.ndarray
-    digest: str
-
-
 class StageConfig(Settings):
     """A whisker on a stage as a source: one view of 1 x 1 x 3, the sizes of the three signals."""
 
@@ -240,14 +185,14 @@ class StageConfig(Settings):
     """Rows per second; the files have no time."""
 
 
-def read_stage(path: Path) -> StageRecording:
-    """Reads a file.
+def read_stage(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """Position [N, 3] of the stage, m, and signal [N, 3], counts, of N rows; sha256 (hex) of the file.
 
     Raises:
         InputError: as `read_columns`.
     """
     table, digest = read_columns(path, ("", "px", "py", "pz", "sx", "sy", "sz"))  # the index has no name
-    return StageRecording(table[:, 1:4] * 1e-3, table[:, 4:], digest)
+    return table[:, 1:4] * 1e-3, table[:, 4:], digest
 
 
 def read_stage_calibration(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -261,16 +206,16 @@ def read_stage_calibration(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarr
     Raises:
         InputError: as `read_stage`, or a single row at the base.
     """
-    recording = read_stage(path)
-    base = recording.position[0]
-    free = np.linalg.norm(recording.position - base, axis=1) < 1e-6  # m
+    position, signal, _ = read_stage(path)
+    base = position[0]
+    free = np.linalg.norm(position - base, axis=1) < 1e-6  # m
     if free.sum() < 2 or free.all():
         expected = "a calibration that returns to the position of its first row, the whisker's base"
         raise InputError(str(path), f"{free.sum()} of {len(free)} rows at the first position", expected)
     index = np.arange(len(free))
-    baseline = [np.interp(index, index[free], channel[free]) for channel in recording.signal.T]
-    above = recording.signal - np.stack(baseline, axis=1)
-    return recording.position[~free], above[~free], base
+    baseline = [np.interp(index, index[free], channel[free]) for channel in signal.T]
+    above = signal - np.stack(baseline, axis=1)
+    return position[~free], above[~free], base
 
 
 def _open_stage(config: StageConfig) -> Source:
@@ -279,15 +224,15 @@ def _open_stage(config: StageConfig) -> Source:
     Raises:
         InputError: as `read_stage`.
     """
-    recording = read_stage(config.file)
-    count = len(recording.signal)
+    position, signal, digest = read_stage(config.file)
+    count = len(signal)
     time = np.arange(count) / config.rate_hz
-    size = np.abs(recording.signal - recording.signal[0])
-    x, y = recording.position[:, :2].T
-    steps = np.diff(recording.position, axis=0, prepend=recording.position[:1])
+    size = np.abs(signal - signal[0])
+    x, y = position[:, :2].T
+    steps = np.diff(position, axis=0, prepend=position[:1])
     return _source(
         config.file.stem,
-        recording.digest,
+        digest,
         time,
         (size / max(size.max(), 1e-300)).reshape(count, 1, 1, 3),
         motion=from_motions(time, steps[:, 0], steps[:, 1], np.zeros(count)),
@@ -318,9 +263,10 @@ def read_object(path: Path) -> tuple[np.ndarray, str]:
     16 successive ones are taken to.
 
     Raises:
-        InputError: as `_read_rows`, or a row is not of 128 whole numbers.
+        InputError: as `read_columns`, or a row is not of 128 whole numbers.
     """
-    table, digest = _read_rows(path, OBJECTS_WHISKERS * 16)
+    columns = [f"column {number}" for number in range(1, OBJECTS_WHISKERS * 16 + 1)]
+    table, digest = read_columns(path, columns, header=False)
     if (broken := np.argwhere(table != np.round(table))).size:
         row, column = broken[0].tolist()
         found = f"{table[row, column]:g} in column {column + 1}"

@@ -67,7 +67,7 @@ def change(lines: list[str], row: int, column: int, value: str) -> list[str]:
         (lambda lines: [], "is empty"),
         (lambda lines: lines[:1], "no rows"),
         (lambda lines: lines[:-1] + [lines[-1].rstrip("\n")], "last line is cut"),
-        (lambda lines: lines[:-1] + [lines[-1][:40] + "\n"], "cells; expected 50 numbers"),
+        (lambda lines: lines[:-1] + [lines[-1][:40] + "\n"], "cells; expected 50"),
         (lambda lines: ["\ufeff" + lines[0], *lines[1:4], "3,x\n"], r"reach\.csv:5: 2 cells"),
         (lambda lines: lines[:5] + lines[6:], "row 4: row number 5; expected 4"),
         (lambda lines: change(lines, 7, 9, "nan"), rf"reach\.csv:9: {COLUMNS[9]} is nan"),

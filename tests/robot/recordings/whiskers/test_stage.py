@@ -21,10 +21,10 @@ ROW = "0,1.0,2.0,3.0,4.0,5.0,6.0"
 
 
 def test_a_sweep_is_in_metres() -> None:
-    sweep = read_stage(SLICES / "stage_cylinder_2.csv")
-    assert sweep.position.shape == sweep.signal.shape == (101, 3)
-    assert sweep.signal[0].tolist() == [0.0, 0.0, 0.0]
-    np.testing.assert_allclose(np.diff(sweep.position[1:], axis=0), [[-0.07 / 99, 0.0, 0.0]] * 99, atol=1e-9)
+    position, signal, _ = read_stage(SLICES / "stage_cylinder_2.csv")
+    assert position.shape == signal.shape == (101, 3)
+    assert signal[0].tolist() == [0.0, 0.0, 0.0]
+    np.testing.assert_allclose(np.diff(position[1:], axis=0), [[-0.07 / 99, 0.0, 0.0]] * 99, atol=1e-9)
 
 
 def test_a_calibration_is_above_the_signal_at_the_base() -> None:
@@ -32,9 +32,9 @@ def test_a_calibration_is_above_the_signal_at_the_base() -> None:
     reach = np.linalg.norm(position - base, axis=1)
     assert reach.min() > 4e-3
     assert reach.max() < 43e-3
-    raw = read_stage(SLICES / "stage_calibration.csv")
+    _, raw, _ = read_stage(SLICES / "stage_calibration.csv")
     # The first ray starts with the free signal.
-    np.testing.assert_allclose(signal[0], raw.signal[1] - raw.signal[0], atol=10.0)
+    np.testing.assert_allclose(signal[0], raw[1] - raw[0], atol=10.0)
 
 
 @pytest.mark.parametrize(
@@ -46,8 +46,8 @@ def test_a_calibration_is_above_the_signal_at_the_base() -> None:
         (HEADER + "\n" + ROW + "\n1,1.0,2.0,3.0,4.0\n", r"bad\.csv:3: 5 cells"),
         (HEADER + "\n" + ROW, "last line is cut"),
         (HEADER + "\n0,1.0,2.0,3.0,nan,5.0,6.0\n", r"bad\.csv:2: sx is nan"),
-        (HEADER + "\n0,1.0,2.0,3.0,four,5.0,6.0\n", r"bad\.csv:2: 'four' in sx; expected a number"),
-        ("\udcff" + HEADER + "\n" + ROW + "\n", "not UTF-8"),
+        (HEADER + "\n0,1.0,2.0,3.0,four,5.0,6.0\n", r"bad\.csv:2: sx is 'four'; expected a number"),
+        ("\udcff" + HEADER + "\n" + ROW + "\n", "is not text"),
     ],
 )
 def test_a_bad_file_gives_one_error(tmp_path: Path, text: str, found: str) -> None:
