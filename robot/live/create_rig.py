@@ -281,12 +281,7 @@ def run_create_loop(
             mapper.offer(sample)
             tell(stamp, doing.state, moment)
             if not sampled:
-                # The robot rests; the reader limits the time.
-                rig.record_event("held", "the whiskers send no samples")
-                rig.wait_until(
-                    lambda: rig.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the whiskers"
-                )
-                rig.record_event("resumed", "the whiskers send samples")
+                rig.await_samples("the whiskers send")  # the robot rests
             doing = next_state(plan.behaviour, doing, moment, odometry.dtheta, random, LEAST_TURN)
             touching, number = contact, number + 1
     finally:
@@ -379,12 +374,10 @@ def _wait_for_mapper(rig: CreateRig, mapper: AsyncMapper) -> None:
         return
     rig.robot.stop()
     rig.record_event("held", "the mapper is behind")
-    what = "the mapper, to catch up,"
-    rig.wait_until(
-        lambda: mapper.behind() <= rig.create.budget or not mapper.alive,
-        MAPPER_WAIT,
-        SessionOutcome.MAPPER_GONE,
-        what,
-    )
+
+    def caught_up() -> bool:
+        return mapper.behind() <= rig.create.budget or not mapper.alive
+
+    rig.wait_until(caught_up, MAPPER_WAIT, SessionOutcome.MAPPER_GONE, "the mapper, to catch up,")
     check_mapper(mapper)
     rig.record_event("resumed", "the mapper has caught up")

@@ -150,6 +150,13 @@ class PolledRig:
             self.poll()
             time.sleep(TICK)
 
+    def await_samples(self, whose: str) -> None:
+        """Waits until the head (`whose`: its name and verb) sends samples again. The reader limits the time
+        and turns it into a fault; see `wait_until`."""
+        self.record_event("held", f"{whose} no samples")
+        self.wait_until(lambda: self.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, whose)
+        self.record_event("resumed", f"{whose} samples")
+
     def __enter__(self) -> Self:
         return self
 

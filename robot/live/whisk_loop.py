@@ -88,10 +88,7 @@ def run_whisk_loop(
                 break
         else:
             rig.arm.halt()
-            rig.record_event("held", "the head sends no samples")
-            # The reader limits the waiting time and turns it into a fault.
-            rig.wait_until(lambda: rig.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, "the head")
-            rig.record_event("resumed", "the head sends samples")
+            rig.await_samples("the head sends")
             route.resend_last()
 
 

@@ -13,7 +13,7 @@ a cycle by the same function live and in replay.
 from __future__ import annotations
 
 import zlib
-from collections import deque
+from collections import Counter, deque
 from typing import NamedTuple
 
 import numpy as np
@@ -184,20 +184,13 @@ class Decoder:
         self._run = BATCH
         self._numbering = SequenceUnwrapper()
         self._time: int | None = None
-        self._good = self._bad = self._skipped = self._overruns = self._duplicates = 0
+        self._counts = Counter[str]()
 
     @property
     def counts(self) -> DecoderCounts:
         """Counts so far."""
-        return DecoderCounts(
-            good=self._good,
-            bad=self._bad,
-            missing=self._numbering.missing,
-            skipped_bytes=self._skipped,
-            overruns=self._overruns,
-            duplicates=self._duplicates,
-            restarts=max(0, self._numbering.streams - 1),
-        )
+        restarts = max(0, self._numbering.streams - 1)
+        return DecoderCounts(missing=self._numbering.missing, restarts=restarts, **self._counts)
 
     @property
     def pending(self) -> int:
@@ -210,7 +203,7 @@ class Decoder:
         Args:
             time: approximate device clock now, us; None: the time of the next frame starts the stream.
         """
-        self._skipped += len(self._rest)
+        self._counts["skipped_bytes"] += len(self._rest)
         self._rest = b""
         self._numbering.restart()
         self._time = time
@@ -221,19 +214,18 @@ class Decoder:
         runs: list[bytes] = []
         place = 0
         while 0 <= (start := buffer.find(MAGIC, place)) <= len(buffer) - self._size:
-            self._skipped += start - place
+            self._counts["skipped_bytes"] += start - place
             place = start + self._count_valid(buffer, start) * self._size
             if place > start:
                 runs.append(buffer[start:place])
             else:
-                self._bad += 1
-                self._skipped += 1
+                self._counts.update(("bad", "skipped_bytes"))
                 place += 1
         end = start
         if end < 0:  # the last bytes may be the start of the magic
             tail = buffer[max(place, len(buffer) - 3) :]
             end = len(buffer) - next((k for k in range(len(tail), 0, -1) if tail.endswith(MAGIC[:k])), 0)
-        self._skipped += end - place
+        self._counts["skipped_bytes"] += end - place
         self._rest = buffer[end:]
         return self._accept(np.frombuffer(b"".join(runs), self._type))
 
@@ -261,9 +253,8 @@ class Decoder:
         number, new = self._numbering.take(frames["sequence"])
         if not new.all():
             frames, number = frames[new], number[new]
-        self._good += len(frames)
-        self._duplicates += len(new) - len(frames)
-        self._overruns += int(np.count_nonzero(frames["flags"] & FrameFlag.OVERRUN))
+        overruns = int(np.count_nonzero(frames["flags"] & FrameFlag.OVERRUN))
+        self._counts.update(good=len(frames), duplicates=len(new) - len(frames), overruns=overruns)
         time = frames["time"].astype(np.int64)
         if len(time):  # unwrapped: each within half of the range of the previous one
             before = int(time[0]) if self._time is None else self._time

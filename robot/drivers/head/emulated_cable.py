@@ -217,8 +217,7 @@ class SocketBackend:
         return len(packet)
 
     def bulk_read(self, dev_handle: _Handle, ep: int, intf: int, buff: array, timeout: int) -> int:
-        got = self._request(dev_handle, Op.BULK, ep, size=_size(buff), timeout=timeout)
-        return _fill(buff, got)
+        return self._receive(dev_handle, Op.BULK, ep, buff, timeout=timeout)
 
     def ctrl_transfer(
         self,
@@ -232,10 +231,10 @@ class SocketBackend:
     ) -> int:
         setup = {"request": bRequest, "value": wValue, "index": wIndex, "timeout": timeout}
         if bmRequestType & IN:
-            got = self._request(dev_handle, Op.CONTROL, bmRequestType, size=_size(data), **setup)
-            return _fill(data, got)
-        self._request(dev_handle, Op.CONTROL, bmRequestType, data=data.tobytes(), **setup)
-        return _size(data)
+            return self._receive(dev_handle, Op.CONTROL, bmRequestType, data, **setup)
+        packet = data.tobytes()
+        self._request(dev_handle, Op.CONTROL, bmRequestType, data=packet, **setup)
+        return len(packet)
 
     def clear_halt(self, dev_handle: _Handle, ep: int) -> None:
         self._request(dev_handle, Op.CLEAR, ep)
@@ -260,6 +259,13 @@ class SocketBackend:
     def _request(self, handle: _Handle, op: Op, address: int = 0, **more: Any) -> bytes:
         line = handle.inwards if op == Op.BULK and address & IN else handle.other
         return _as_usb_error(lambda: line.call(op, address, **more))
+
+    def _receive(self, handle: _Handle, op: Op, address: int, buffer: array, **more: Any) -> int:
+        """Requests bytes into a buffer; returns their number."""
+        place = memoryview(buffer).cast("B")
+        got = self._request(handle, op, address, size=len(place), **more)
+        place[: len(got)] = got
+        return len(got)
 
 
 def _as_usb_error(action: Callable[[], T]) -> T:
@@ -292,12 +298,3 @@ def _descriptor(layout: str, names: str, data: bytes, **more: Any) -> SimpleName
 def _require_first(*index: int) -> None:
     if any(index):
         raise IndexError(f"descriptor {index}: the device has one of each")
-
-
-def _size(buffer: array) -> int:
-    return len(buffer) * buffer.itemsize
-
-
-def _fill(buffer: array, data: bytes) -> int:
-    memoryview(buffer).cast("B")[: len(data)] = data
-    return len(data)

@@ -295,23 +295,18 @@ def check_controller(config: ArmConfig) -> dashboard.ControllerStatus:
         raise StartupRefused(
             str(silent), "", "check the cable, the address and that the controller is on"
         ) from None
-    version = ".".join(map(str, controller.version))
-    if controller.version < dashboard.MIN_POLYSCOPE:
-        raise StartupRefused(f"PolyScope {version}", "3.4 or newer", "update the controller")
-    if controller.mode != "RUNNING":
-        raise StartupRefused(
-            f"robot mode {controller.mode}", "RUNNING", "power the arm on and release its brakes"
-        )
-    if controller.safety not in ("NORMAL", "REDUCED"):
-        raise StartupRefused(
-            f"safety mode {controller.safety}", "NORMAL or REDUCED", "release the stop on the pendant"
-        )
-    if controller.remote is False:
-        raise StartupRefused(
-            "under local control", "remote control", "switch it on the pendant, at the upper right"
-        )
-    if controller.program:
-        raise StartupRefused("a program runs on the controller", "none", "stop it on the pendant")
+    version, mode, safety, program, remote = controller
+    polyscope = f"PolyScope {'.'.join(map(str, version))}"
+    faulty, local = safety not in ("NORMAL", "REDUCED"), remote is False
+    for wrong, *words in (
+        (version < dashboard.MIN_POLYSCOPE, polyscope, "3.4 or newer", "update the controller"),
+        (mode != "RUNNING", f"robot mode {mode}", "RUNNING", "power the arm on and release its brakes"),
+        (faulty, f"safety mode {safety}", "NORMAL or REDUCED", "release the stop on the pendant"),
+        (local, "under local control", "remote control", "switch it on the pendant, at the upper right"),
+        (program, "a program runs on the controller", "none", "stop it on the pendant"),
+    ):
+        if wrong:
+            raise StartupRefused(*words)
     return controller
 
 

@@ -9,7 +9,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from robot.emulators.ur10.kinematics import Vector6
 from tactile.base.settings import Settings
 
-SCRIPT_PORT, DASHBOARD_PORT = 30003, 29999  # fixed in the client library
+SCRIPT_PORT = 30003  # fixed in the client library
 FAULT_PORT = 30098
 
 

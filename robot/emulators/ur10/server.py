@@ -18,18 +18,12 @@ from collections.abc import Callable
 from typing import Any
 
 from robot.drivers.processes import urgent
-from robot.drivers.ur10 import rtde_protocol
+from robot.drivers.ur10 import dashboard, rtde_protocol
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
 from robot.emulators.listening import answer_fault, do_fault, listening
 from robot.emulators.ur10.controller import EmulatedController, RobotMode, Runtime, Value
 from robot.emulators.ur10.emulated_arm import Unreachable
-from robot.emulators.ur10.emulator_config import (
-    DASHBOARD_PORT,
-    FAULT_PORT,
-    SCRIPT_PORT,
-    UrEmulatorConfig,
-    WallConfig,
-)
+from robot.emulators.ur10.emulator_config import FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig, WallConfig
 from robot.emulators.ur10.kinematics import vector6
 from tactile.base.errors import InputError
 
@@ -72,7 +66,7 @@ class _ControllerServer:
         ports: dict[int, Callable[[], RtdeSession | _LineSession]] = {
             RTDE_PORT: lambda: RtdeSession(self.controller, self.claims),
             SCRIPT_PORT: lambda: ScriptSession(self.controller),
-            DASHBOARD_PORT: lambda: DashboardSession(self.controller),
+            dashboard.PORT: lambda: DashboardSession(self.controller),
             FAULT_PORT: lambda: _LineSession(self.faults.answer),
         }
         for port, make_session in ports.items():
