@@ -20,15 +20,8 @@ from robot.drivers.head.usb_protocol import to_radians
 from robot.drivers.outcome import SessionOutcome
 from robot.live.live_config import LiveConfig
 from robot.live.polling import AsyncMapper, OperatorStop, PolledRig, SessionFault, check_mapper, session_fault
-from robot.simulation.create.state_machine import (
-    CreateState,
-    MachineState,
-    WheelCommand,
-    motion_end,
-    next_state,
-    planned_rows,
-    wheel_command,
-)
+from robot.simulation.create import state_machine
+from robot.simulation.create.state_machine import CreateState, MachineState, motion_end, next_state
 from robot.simulation.create.strain_sensors import fixed_whiskers
 from robot.sources.source import Sample
 from tactile.base.random_streams import stream
@@ -301,8 +294,8 @@ def _execute(
         samples to its end.
     """
     behaviour, monitor = rig.create.plan.behaviour, rig.monitor
-    command = wheel_command(behaviour, doing)
-    last = planned_rows(behaviour, command) - 1
+    command = state_machine.wheel_command(behaviour, doing)
+    last = state_machine.planned_rows(behaviour, command) - 1
     if rig.bumped:
         rig.robot.release()
     life = rig.stream.restarts
@@ -339,7 +332,7 @@ def _execute(
     return moment, contact, _strain_series(rig, doing.state, row + 1), True
 
 
-def _drive(rig: CreateRig, command: WheelCommand) -> float:
+def _drive(rig: CreateRig, command: state_machine.WheelCommand) -> float:
     """Sends or renews a command; returns the time. A stopped robot is left to the next poll."""
     try:
         rig.robot.drive(command.speed, command.rate)

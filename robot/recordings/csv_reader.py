@@ -8,29 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from robot.recordings import alignment, sanity_checks
 from robot.recordings import csv_config as columns
-from robot.recordings.alignment import (
-    blank_rows,
-    interpolated_poses,
-    judged,
-    nearest_rows,
-    range_errors,
-    range_pixels,
-)
 from robot.recordings.csv_config import split_unit
 from robot.recordings.csv_file import EMPTY, CsvFile, read_csv
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, UnitLimits, heading_errors
-from robot.recordings.sanity_checks import (
-    SPOILT,
-    WHOLE,
-    RowName,
-    Stretch,
-    clock_errors,
-    first_error,
-    leave_out,
-    still_axis,
-    view_errors,
-)
+from robot.recordings.sanity_checks import RowName, clock_errors, first_error
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors
 from robot.sources.odometry import from_motions, from_poses, from_velocities
@@ -78,7 +61,7 @@ def read_csv_recording(
     found = {name: read_csv(name, config.units.time) for name in dict.fromkeys(paths)}
     raise_errors(_absences(found[path], found, config))
     digest, warn = digest_of(file.content for file in found.values()), judge.warn
-    if judge.stretch != WHOLE:
+    if judge.stretch != sanity_checks.WHOLE:
         found = _within(found, path, config, judge.stretch)
 
     whole, part = found[path], config.pose or config.velocity or config.motion
@@ -99,7 +82,7 @@ def read_csv_recording(
     motion, poses, faults = _motion(base, time, kept, config, judge.limits)
     shape, held = (config.rows, config.columns, 1), isinstance(part, columns.VelocityColumns)
     errors += faults
-    source = blank_rows(path, time, motion, shape)
+    source = alignment.blank_rows(path, time, motion, shape)
     # What belongs to a row that is left out, is left out too.
     every, rows = time, np.arange(len(whole.lines))
     if len(kept) < len(rows):  # the times of rows that are left out lie between those of their neighbours
@@ -139,11 +122,11 @@ def read_csv_recording(
     info = SourceInfo(labels_only=ids_alone, planar_whiskers=source.pop("sensors", None))
     cures = "--set recording.table.units.{}={}".format
     found_all = InMemorySource(digest=digest, info=info, **source)
-    return judged(found_all, errors, judge, str(path), base.place, held, poses, cures)
+    return alignment.judged(found_all, errors, judge, str(path), base.place, held, poses, cures)
 
 
 def _within(
-    files: Mapping[Path, CsvFile], path: Path, config: columns.CsvConfig, stretch: Stretch
+    files: Mapping[Path, CsvFile], path: Path, config: columns.CsvConfig, stretch: sanity_checks.Stretch
 ) -> dict[Path, CsvFile]:
     """The files, each with its rows within a stretch of the odometry."""
     base, found = files[path], dict(files)
@@ -245,11 +228,11 @@ def _sound_rows(
         latest = np.maximum.accumulate(np.where(bad, -np.inf, moments))
         late = ~bad & np.append(False, moments[1:] <= latest[:-1])
         set_back = (late[1:] & late[:-1]).any() and hole < np.inf  # without its rows their motion is lost
-        if late.any() and (bad | late).sum() <= max(1, SPOILT * len(bad)) and not set_back:
+        if late.any() and (bad | late).sum() <= max(1, sanity_checks.SPOILT * len(bad)) and not set_back:
             bad, errors = bad | late, errors + clock_errors(moments, time, file.place)
     kept = np.flatnonzero(~bad)
     many = np.diff(kept).max(initial=0) > hole + 1
-    if bad.any() and (many or leave_out(int(bad.sum()), len(bad), what, errors[0], warn)):
+    if bad.any() and (many or sanity_checks.leave_out(int(bad.sum()), len(bad), what, errors[0], warn)):
         return np.arange(len(bad)), errors
     return kept, []
 
@@ -289,13 +272,13 @@ def _views(files: _Files, part: columns.ViewColumns, shape: tuple[int, int, int]
     there, seen = there[good], seen.rows(good)
     values, errors = seen.block(part.prefix, part.unit)[0], []
     if part.max_range is None:
-        errors += view_errors(values.min(axis=1), values.max(axis=1), what, seen.place)
+        errors += sanity_checks.view_errors(values.min(axis=1), values.max(axis=1), what, seen.place)
     else:
         values = np.where(np.isposinf(values), part.max_range, values)  # REP-117: no object in range
         typical = float(np.median(values)) if len(values) else 0.0
-        lowest, key = values.min(axis=1), "table.views.max_range"
-        errors += range_errors(lowest, typical, part.max_range, what, seen.place, str(file.path), key)
-        values = range_pixels(values, pixels, part.max_range)
+        low, key = values.min(axis=1), "table.views.max_range"
+        errors += alignment.range_errors(low, typical, part.max_range, what, seen.place, str(file.path), key)
+        values = alignment.range_pixels(values, pixels, part.max_range)
     rows, faults = _match_rows(files, file, there, part)
     return rows, values.reshape(-1, *shape), errors + faults
 
@@ -396,7 +379,7 @@ def align_truth(
     errors += clock_errors(moments, part.time, file.place)
     if errors:
         return unknown, errors
-    return interpolated_poses(time, moments, truth, part.time, str(file.path))
+    return alignment.interpolated_poses(time, moments, truth, part.time, str(file.path))
 
 
 def column_keys(part: Settings, key: str) -> list[tuple[str, str]]:
@@ -457,7 +440,7 @@ def other_plane(file: CsvFile, x: str, y: str) -> tuple[str, str] | None:
     z = name[:-1] + {"y": "z", "Y": "Z"}.get(name[-1:], name[-1:])
     if z == name or z not in file.names:
         return None
-    still = still_axis(file.values[:, [file.at(name) for name in (x, y, z)]])
+    still = sanity_checks.still_axis(file.values[:, [file.at(name) for name in (x, y, z)]])
     return (still, z) if still else None
 
 
@@ -488,7 +471,7 @@ def each_nearest(
     """
     if not (np.diff(time) > 0).all():
         return np.zeros(len(moments), int), []  # the error of the clock is already reported
-    rows, away, reach = nearest_rows(moments, time, tolerance)
+    rows, away, reach = alignment.nearest_rows(moments, time, tolerance)
     far, cure = away > reach, "raise tolerance, or bring both to one clock"
     one = f"(one of {int(far.sum())} such rows)"
     found_far = lambda i: f"the nearest odometry row is {away[i]:.4g} s away {one}"  # noqa: E731

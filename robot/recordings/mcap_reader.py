@@ -24,18 +24,8 @@ from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata, 
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from robot.drivers.head.decoder import Frames, FrameWindow, assemble_cycle
-from robot.recordings.cdr import (
-    CUT,
-    FRAMES,
-    MAX_NUMBERS,
-    READINGS,
-    SCHEMA_OF,
-    SCHEMAS,
-    TRUTH,
-    Event,
-    Malformed,
-    decode,
-)
+from robot.recordings import cdr
+from robot.recordings.cdr import Event, Malformed
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.sanity_checks import clock_errors, first_error, nonfinite_errors, view_errors
 from robot.sources.input_files import digest_of, raise_errors, readable, require_file
@@ -143,7 +133,7 @@ def read_metadata(data: Mapping[str, str]) -> SourceDescription:
         info = SourceInfo.from_json(data["info"])
     except KeyError as error:
         raise Malformed(f"its metadata lack {error}") from error
-    if min(*shape, whiskers + 1) < 1 or rows * columns * channels + 3 * whiskers > MAX_NUMBERS:
+    if min(*shape, whiskers + 1) < 1 or rows * columns * channels + 3 * whiskers > cdr.MAX_NUMBERS:
         raise Malformed(f"views of shape {shape} and {whiskers} whiskers")
     return SourceDescription((rows, columns, channels), whiskers, rate_hz, info, program)
 
@@ -258,7 +248,7 @@ class McapScanner:
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
-                    names[record.id] = _schema_of(record, schemas) if record.topic in SCHEMA_OF else ""
+                    names[record.id] = _schema_of(record, schemas) if record.topic in cdr.SCHEMA_OF else ""
                 elif isinstance(record, Message):
                     name = names.get(record.channel_id, "")
                     if not name:
@@ -267,12 +257,12 @@ class McapScanner:
                         raise Malformed("a message before the metadata")
                     if record.sequence != self._number % (1 << 32):
                         raise Malformed(f"message {record.sequence} where {self._number} was expected")
-                    if name == TRUTH:
+                    if name == cdr.TRUTH:
                         truth = record.data, self._decoded(name, record.data)[1]
                         continue
                     self._number += 1
                     time, content = self._decoded(name, record.data)
-                    if name not in READINGS:
+                    if name not in cdr.READINGS:
                         yield RecordingEntry(name, time, record.data, None, content)
                         continue
                     self.count += 1
@@ -291,17 +281,17 @@ class McapScanner:
     def _decoded(self, name: str, message: bytes) -> tuple[float, Any]:
         """The time and the content of a message with this schema; of a cut its cycle."""
         assert self.description is not None
-        time, content = decode(name, message, self.description.view_shape, self.description.whiskers)
-        if name == FRAMES:
+        time, content = cdr.decode(name, message, self.description.view_shape, self.description.whiskers)
+        if name == cdr.FRAMES:
             self._frames.add(content)
-        if name == CUT:
+        if name == cdr.CUT:
             content = assemble_cycle(self._frames.between(content.first, content.last), content)
         return time, content
 
     def _check_counts(self, statistics: Statistics, names: Mapping[int, str]) -> None:
         """Compare counts, since a chunk with a damaged type is skipped as an unknown record."""
         counts = statistics.channel_message_counts
-        others = {channel for channel, name in names.items() if name in ("", TRUTH)}
+        others = {channel for channel, name in names.items() if name in ("", cdr.TRUTH)}
         written = sum(count for channel, count in counts.items() if channel not in others)
         if written != self._number:
             raise Malformed(f"{self._number} messages where {written} were written")
@@ -321,8 +311,8 @@ class McapScanner:
 
 def _schema_of(channel: Channel, schemas: Mapping[int, Schema]) -> str:
     """The schema name of a ratslam topic; raises `Malformed` if another version defined it differently."""
-    name, schema = SCHEMA_OF[channel.topic], schemas.get(channel.schema_id)
-    if schema is None or schema.data != SCHEMAS[name].encode():
+    name, schema = cdr.SCHEMA_OF[channel.topic], schemas.get(channel.schema_id)
+    if schema is None or schema.data != cdr.SCHEMAS[name].encode():
         raise Malformed(f"messages on {channel.topic} with another definition than this version's")
     return name
 

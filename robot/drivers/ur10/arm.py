@@ -27,22 +27,9 @@ import numpy as np
 
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.processes import LatenessMeter, withheld_signals
-from robot.drivers.ur10 import dashboard
+from robot.drivers.ur10 import dashboard, safety
 from robot.drivers.ur10.driver_config import ArmConfig
-from robot.drivers.ur10.safety import (
-    RETREAT_SPEED,
-    Finding,
-    Move,
-    StartupRefused,
-    TargetRefused,
-    at_rest,
-    at_target,
-    check_controller,
-    check_states,
-    plan_move,
-    retreat_target,
-    stale_finding,
-)
+from robot.drivers.ur10.safety import Finding, Move, StartupRefused, TargetRefused
 from robot.drivers.ur10.shared_state import SharedState
 
 __all__ = ["Arm", "StartupRefused", "TargetRefused"]
@@ -189,7 +176,7 @@ class Arm:
 
         Raises:
             StartupRefused: a check failed; nothing has moved."""
-        check_controller(self.config)
+        safety.check_controller(self.config)
         first = self.shared.newest + 1
         self.shared.control["first"] = first
         self.shared.control["heartbeat"] = time.monotonic()
@@ -202,7 +189,7 @@ class Arm:
             self._thread.start()
         try:
             self._await_ready(process)
-            check_states(self.config, lambda: self.states(first - 1))
+            safety.check_states(self.config, lambda: self.states(first - 1))
             with self.lock:
                 if self.process is not None:
                     self._read_reports(self.process)
@@ -246,7 +233,7 @@ class Arm:
     def still(self) -> bool:
         """Whether the newest state is recent and shows an arm at rest."""
         state = self.shared.latest()
-        return state is not None and self.age() <= self.config.stale and at_rest(state)
+        return state is not None and self.age() <= self.config.stale and safety.at_rest(state)
 
     def move(self, tcp: Any, speed: float | None = None) -> Move:
         """Starts a straight move of the tool to a pose [6] and returns at once. It replaces the present move.
@@ -258,7 +245,7 @@ class Arm:
             state = self.latest()
             if self.fault is not None or not self.armed or state is None:
                 raise TargetRefused(f"the arm does not move: {self.fault or 'it is not armed'}")
-            move = plan_move(self.config, tcp, state["tcp"], speed)
+            move = safety.plan_move(self.config, tcp, state["tcp"], speed)
             deadline = time.monotonic() + move.most + self.config.patience
             self._elsewhere = None
             self.pending = self._order("move", move.target, move.speed), move, deadline
@@ -361,7 +348,7 @@ class Arm:
         age, pending = self.age(), self.pending
         if age > self.config.stale:
             late = max(self._late, float(self.shared.control["late"]))  # of this thread or the RTDE process
-            return stale_finding(age, late, self.config.stale)
+            return safety.stale_finding(age, late, self.config.stale)
         if pending is None or pending[0] == self._done:
             return None
         number, move, deadline = pending
@@ -387,7 +374,7 @@ class Arm:
     def _deviation(self, pending: PendingMove) -> str | None:
         """Distance of the arm from its target, in words; None at the target."""
         state, target = self.shared.latest(), pending[1].target
-        if state is None or at_target(self.config, state["tcp"], target):
+        if state is None or safety.at_target(self.config, state["tcp"], target):
             return None
         way = float(np.linalg.norm(state["tcp"][:3] - target[:3]))
         return f"{way * 1e3:.1f} mm from its target"
@@ -400,9 +387,9 @@ class Arm:
             self._stop_by = None
             if self._retreat_pending:
                 self._retreat_pending = False
-                target = retreat_target(self.config, self.history)
+                target = safety.retreat_target(self.config, self.history)
                 if target is not None:
-                    self._order("retreat", target, RETREAT_SPEED)
+                    self._order("retreat", target, safety.RETREAT_SPEED)
         elif now >= self._stop_by:
             self._stop_by_dashboard()
             self._stop_by = now + 2 * DASHBOARD_DELAY

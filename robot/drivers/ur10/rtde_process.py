@@ -29,19 +29,9 @@ import numpy as np
 
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.processes import LatenessMeter, become_urgent
-from robot.drivers.ur10 import dashboard
+from robot.drivers.ur10 import dashboard, safety
 from robot.drivers.ur10.driver_config import ArmConfig
-from robot.drivers.ur10.safety import (
-    MOVED_ON,
-    NO_STATE,
-    RETREAT_SPEED,
-    Finding,
-    TargetRefused,
-    at_rest,
-    check_command,
-    check_state,
-    ended_script_finding,
-)
+from robot.drivers.ur10.safety import Finding, TargetRefused, check_state
 from robot.drivers.ur10.shared_state import ARM_STATE, SharedState
 from tactile.base.errors import InputError
 
@@ -87,7 +77,7 @@ class CommandThread:
         self.script_unusable = False
         self.leaving = False
         self._retreating = False
-        self._watch = NO_STATE
+        self._watch = safety.NO_STATE
         self._rest = np.zeros(6)
         self._force_limit = math.inf  # N; contacts are detected once the force at rest is known
         self._own_stops = 0
@@ -172,10 +162,10 @@ class CommandThread:
         if here is None or self._revoked(order):
             return
         try:
-            target = check_command(self.config, order.target, here["tcp"], order.speed)
+            target = safety.check_command(self.config, order.target, here["tcp"], order.speed)
             if order.do == "retreat":
                 way = math.dist(target[:3], here["tcp"][:3])
-                if way > self.config.backoff + 2 * MOVED_ON or order.speed > RETREAT_SPEED:
+                if way > self.config.backoff + 2 * safety.MOVED_ON or order.speed > safety.RETREAT_SPEED:
                     raise TargetRefused(f"a retreat of {way:.3f} m at {order.speed:g} m/s exceeds the limits")
         except TargetRefused as refused:
             self.hold(Finding(SessionOutcome.NOT_ARRIVED, f"the RTDE process refused the target: {refused}"))
@@ -211,16 +201,8 @@ PLAYING = 2  # runtime state
 REST_TIME = 0.25  # s of states at rest, over which the force at rest is averaged
 LAST_STOP = 0.4  # s, duration of the last stop before the dashboard server is used
 
-VARIABLES = [
-    "timestamp",
-    "actual_TCP_pose",
-    "actual_TCP_speed",
-    "actual_TCP_force",
-    "actual_q",
-    "robot_mode",
-    "safety_status_bits",
-    "runtime_state",
-]
+VARIABLES = ["timestamp", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force", "actual_q"]
+VARIABLES += ["robot_mode", "safety_status_bits", "runtime_state"]
 
 
 class _RtdeProcess:
@@ -244,7 +226,7 @@ class _RtdeProcess:
         period = 0.25 / self.config.hz
         lateness = LatenessMeter(period, began)
         while True:
-            stands = self.commands.leaving and self.commands.stops_sent and at_rest(self._state)
+            stands = self.commands.leaving and self.commands.stops_sent and safety.at_rest(self._state)
             if stands or time.monotonic() > self._leaving:  # the last stop has timed out
                 dashboard.stop_program(self.config.host)
                 return
@@ -254,7 +236,7 @@ class _RtdeProcess:
                 self.commands.check_state(self._state)
                 if self._settled and self._state["runtime"] != PLAYING:
                     unreset, late = self.commands.unreset(now), float(self.shared.control["late"])
-                    self.commands.hold(ended_script_finding(self.config, unreset, late))
+                    self.commands.hold(safety.ended_script_finding(self.config, unreset, late))
             elif (
                 now - self._state["host"] > MAX_MISSING_STATES / self.config.hz
                 and not self.receive.isConnected()

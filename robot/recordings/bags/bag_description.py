@@ -11,22 +11,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from robot.recordings.bags import transforms
 from robot.recordings.bags.bag import Bag, Topic, leaps, nanoseconds
 from robot.recordings.bags.bag_reader import ARRAYS, JOINTS
-from robot.recordings.bags.transforms import (
-    BODIES,
-    FORWARD,
-    MOVING,
-    ODOMETRY,
-    POSES,
-    STATIC,
-    TWISTS,
-    frames_of,
-    mount_of,
-    pose_in_plane,
-    read_links,
-    twist_in_plane,
-)
+from robot.recordings.bags.transforms import FORWARD, ODOMETRY, POSES, TWISTS, mount_of
 from robot.recordings.bags.views import (
     CLOUD,
     IMAGES,
@@ -142,12 +130,12 @@ def describe_bag(path: Path) -> BagDescription:
     with Bag(path, told.append) as bag:
         topics = tuple(_describe_topic(bag, topic) for topic in bag.topics.values() if topic.total)
         links = []
-        for name in (MOVING, STATIC):
+        for name in (transforms.MOVING, transforms.STATIC):
             try:
-                found = read_links(bag, name)
+                found = transforms.read_links(bag, name)
             except InputError:
                 continue  # the fault of the topic says why
-            links += [(*pair, name == STATIC, len(link)) for pair, link in found.items()]
+            links += [(*pair, name == transforms.STATIC, len(link)) for pair, link in found.items()]
     return BagDescription(topics, tuple(links), tuple(told))
 
 
@@ -177,7 +165,7 @@ def _describe_topic(bag: Bag, topic: Topic) -> TopicDescription:
                 received.append(time)
                 if hasattr(content, "header"):
                     stamps.append(nanoseconds(content.header.stamp))
-                    frames = frames if any(frames) else frames_of(content)
+                    frames = frames if any(frames) else transforms.frames_of(content)
             shape = _shape_of(bag, topic.kind, kept, stamps or received)
     except InputError as error:
         fault, roles = str(error), ()
@@ -230,8 +218,9 @@ def _summary_of(content: Any, kind: str, where: str) -> Any:
         sizes = tuple(int(dim.size) for dim in content.layout.dim)
         return sizes or (len(content.data),), np.asarray(content.data, float)
     # [6] pose (x, y, heading) and velocity (forward, left, turn), NaN where the type has none
-    pose = pose_in_plane(*POSES[kind](content), where) if kind in POSES else (np.nan,) * 3
-    return np.array([*pose, *(twist_in_plane(TWISTS[kind](content)) if kind in TWISTS else (np.nan,) * 3)])
+    pose = transforms.pose_in_plane(*POSES[kind](content), where) if kind in POSES else (np.nan,) * 3
+    twist = transforms.twist_in_plane(TWISTS[kind](content)) if kind in TWISTS else (np.nan,) * 3
+    return np.array([*pose, *twist])
 
 
 def _shape_of(bag: Bag, kind: str, kept: list[Any], stamps: list[int]) -> Shape:
@@ -330,7 +319,7 @@ def robots_of(bag: BagDescription) -> list[tuple[str, str]]:
     found = []
     for parent, child, fixed, total in bag.links:
         named = None if fixed or total < 2 else WHEELS.fullmatch(parent)
-        if named and child in [named[1] + body for body in (*BODIES, "base")]:
+        if named and child in [named[1] + body for body in (*transforms.BODIES, "base")]:
             found.append((named[1], (parent, child)))
     views = _views(bag)
     frame = "" if views is None else views[0].frame
