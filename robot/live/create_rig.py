@@ -59,9 +59,8 @@ class CreateRig(PolledRig):
         self.robot = CreateDriver(self.create)
         reader = HeadReader(lambda: open_bridge(config.head.address), len(fan.base), config.head)
         super().__init__(config, reader, stopped)
-        self.monitor = StrainMonitor(
-            plan.whiskers.rate, plan.behaviour.period, self.create.strain_per_radian, len(fan.base)
-        )
+        rate, period = plan.whiskers.rate, plan.behaviour.period
+        self.monitor = StrainMonitor(rate, period, self.create.strain_per_radian, len(fan.base))
         self._connections = 0  # of the whiskers, seen so far
         self._free = self.epoch  # newest time at which the bumper was not pressed
 
@@ -270,7 +269,7 @@ def run_create_loop(
             )
             sample = Sample(stamp, report, None)
             if rig.recorder is not None:
-                rig.recorder.add_sample(sample)
+                rig.recorder.add(sample)
             mapper.offer(sample)
             tell(stamp, doing.state, moment)
             if not sampled:

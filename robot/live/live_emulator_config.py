@@ -29,17 +29,12 @@ def arm_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None =
 def head_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> HeadEmulatorConfig:
     """A head in the maze of the session's plan, carried by its arm."""
     where = Address.parse(config.head.address)
-    plan = config.plan
+    alike = ("mechanics", "stream", "maze", "path", "motion", "seed")
     return HeadEmulatorConfig(
         host=host or where.host or config.arm.host,
         port=where.port,
         head=head,
-        mechanics=plan.mechanics,
-        stream=plan.stream,
-        maze=plan.maze,
-        path=plan.path,
-        motion=plan.motion,
-        seed=plan.seed,
+        **{name: getattr(config.plan, name) for name in alike},
         arm=config.arm.host,
         arm_hz=config.arm.hz,
         placing=config.arm.placing,

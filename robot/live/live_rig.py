@@ -120,14 +120,13 @@ class Rig(PolledRig):
     def __init__(self, config: LiveConfig, head: HeadConfig, stopped: Callable[[], bool]) -> None:
         self.shape = ur10_head(head)
         self.arm = Arm(config.arm)
+        shape, link = self.shape, config.head
+
+        def stop(whisker: int) -> None:
+            self.arm.fail(SessionOutcome.CONTACT, f"whisker {whisker} is bent beyond the overload limit")
+
         reader = HeadReader(
-            lambda: open_bridge(config.head.address),
-            len(self.shape.length),
-            config.head,
-            alive=self.shape.alive,
-            on_overload=lambda whisker: self.arm.fail(
-                SessionOutcome.CONTACT, f"whisker {whisker} is bent beyond the overload limit"
-            ),
+            lambda: open_bridge(link.address), len(shape.length), link, alive=shape.alive, on_overload=stop
         )
         self.driver = HeadDriver(reader, self.shape)
         super().__init__(config, reader, stopped)

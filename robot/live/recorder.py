@@ -83,9 +83,14 @@ class LiveRecorder:
                 self._tape.write(cut, truth)
                 self._tape.flush()
 
-    def add_sample(self, sample: Sample) -> None:
-        """Adds a reading that holds all that was measured, after the frames so far, and flushes the file."""
-        self._add(sample)
+    def add(self, content: Sample | Event) -> None:
+        """Adds a reading that holds all that was measured, or an event, after the frames so far, and flushes
+        the file."""
+        with self._writing(content.time) as able:
+            if able:
+                self._write()
+                self._tape.write(content)
+                self._tape.flush()
 
     def add_event(self, time: float, name: str, text: str) -> None:
         """Adds an event and flushes the file.
@@ -93,14 +98,7 @@ class LiveRecorder:
         Args:
             time: s. name: one word. text: details.
         """
-        self._add(Event(time, name, text))
-
-    def _add(self, content: Sample | Event) -> None:
-        with self._writing(content.time) as able:
-            if able:
-                self._write()
-                self._tape.write(content)
-                self._tape.flush()
+        self.add(Event(time, name, text))
 
     def close(self) -> None:
         """Writes pending data and finishes the file; may be called more than once."""

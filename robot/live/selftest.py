@@ -54,8 +54,7 @@ def check_session(config: LiveConfig, head: HeadConfig, directory: Path) -> Iter
     yield f"route: {path.duration:.0f} s, every target is within the arm's limits"
     with Rig(config, head, lambda: False) as rig:
         yield from find_devices(rig)
-        _check_stream(rig)
-        yield f"clocks: head {rig.stream.clock.residual * 1e3:.1f} ms"
+        yield _check_stream(rig)
 
 
 def check_disk(config: LiveConfig, directory: Path) -> str:
@@ -130,8 +129,7 @@ def start_and_check(rig: Rig | CreateRig) -> Iterator[str]:
     else:
         rig.arm.start()
         yield f"arm: {rig.config.arm.host}, admitted, states at {rig.config.arm.hz} Hz"
-    _check_stream(rig)
-    clocks = f"clocks: head {rig.stream.clock.residual * 1e3:.1f} ms"
+    clocks = _check_stream(rig)
     if isinstance(rig, CreateRig):
         yield _check_whiskers(rig)
         yield clocks
@@ -140,8 +138,9 @@ def start_and_check(rig: Rig | CreateRig) -> Iterator[str]:
         yield f"{clocks}, newest state {age * 1e3:.0f} ms old"
 
 
-def _check_stream(rig: PolledRig) -> None:
-    """Listens to the head for a while and checks rate, damage and clock of its samples."""
+def _check_stream(rig: PolledRig) -> str:
+    """Listens to the head for a while and checks rate, damage and clock of its samples; returns a line of
+    text."""
     head, residual = rig.head, rig.config.residual
     identity = head.identity
     assert identity is not None
@@ -160,6 +159,7 @@ def _check_stream(rig: PolledRig) -> None:
     if measured > residual:
         found = f"clock residual of {measured * 1e3:.1f} ms"
         raise InputError("head", found, f"{residual * 1e3:g} ms", "check the load of this machine")
+    return f"clocks: head {measured * 1e3:.1f} ms"
 
 
 def _check_whiskers(rig: CreateRig) -> str:

@@ -116,9 +116,8 @@ def _next_sequence(rig: Rig, number: int) -> _WhiskSequence:
         return next(iter(rig.stream.whisk_starts[known if rig.stream.restarts == life else 0 :]), None)
 
     longest = rig.config.head.patience + 2 / rate + 1.0
-    rig.wait_until(
-        lambda: first_frame() is not None, longest, SessionOutcome.HEAD_SILENT, "the beginning of a whisk"
-    )
+    silent, what = SessionOutcome.HEAD_SILENT, "the beginning of a whisk"
+    rig.wait_until(lambda: first_frame() is not None, longest, silent, what)
     first = first_frame()
     assert first is not None
     device = float(rig.head.ring.between(first, first).time[0]) * 1e-6
@@ -132,9 +131,8 @@ def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
     record = []
     for number in range(count):
         first, last = sequence.frame_range(number)
-        rig.wait_until(
-            partial(_has_arrived, rig, last), 3 * sequence.period + 1.0, SessionOutcome.HEAD_SILENT, "a whisk"
-        )
+        arrived, longest = partial(_has_arrived, rig, last), 3 * sequence.period + 1.0
+        rig.wait_until(arrived, longest, SessionOutcome.HEAD_SILENT, "a whisk")
         frames = rig.head.ring.between(first, last)
         begin = sequence.start_of(number)
         cut = Cut.of(number, begin, begin, frames, Odometry(0.0, 0.0, 0.0, 0.0))
@@ -151,10 +149,9 @@ def _hand_on(rig: Rig, sequence: _WhiskSequence, number: int, mapper: AsyncMappe
         return None
     frames = rig.head.ring.between(first, last)
     start = sequence.start + sequence.start_of(number)
-    stamp = sequence.start + sequence.start_of(number + MID_PROTRACTION)
-    odometry, truth = rig.odometer.step(
-        stamp, float(rig.stream.clock.to_host(sequence.device + sequence.start_of(number + MID_PROTRACTION)))
-    )
+    middle = sequence.start_of(number + MID_PROTRACTION)
+    stamp, moment = sequence.start + middle, float(rig.stream.clock.to_host(sequence.device + middle))
+    odometry, truth = rig.odometer.step(stamp, moment)
     # An image needs fewer than `gap` consecutive missing samples, and times without a larger gap either.
     gap, step = rig.config.gap, np.diff(frames.time)
     even = len(step) > 0 and step.min() > 0 and step.max() <= gap * np.median(step)

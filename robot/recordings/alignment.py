@@ -123,9 +123,7 @@ def interpolated_poses(
     """
     columns = [poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2])]
     known = (moments[0] <= time) & (time <= moments[-1])
-    errors = []
-    if not known.any():
-        errors.append(no_overlap_error(moments, time, what, where))
+    errors = [] if known.any() else [no_overlap_error(moments, time, what, where)]
     at = np.column_stack([np.interp(time, moments, column) for column in columns])
     return np.where(known[:, None], at, np.nan), errors
 

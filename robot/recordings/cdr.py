@@ -119,11 +119,6 @@ NUMBERS = ("host", "robot", "tcp", "speed", "force", "joints")
 WORDS = ("mode", "safety", "runtime", "operation", "progress")
 """Fields of an arm state: floating-point numbers and 32-bit words, in the order of the message."""
 _WIDTHS = [ARM_STATE[field].itemsize // 8 for field in NUMBERS]
-_TYPES = {
-    **{"float64": "<f8", "int64": "<i8", "int32": "<i4", "uint32": "<u4", "int16": "<i2"},
-    **{"uint8": "u1", "bool": "?"},
-}
-"""NumPy types of the types in `SCHEMAS`."""
 
 
 class Malformed(ValueError):
@@ -260,12 +255,8 @@ def _frames(record: Any) -> Frames:
     if (flags > 255).any():
         raise Malformed(f"frame flags {int(flags.max())} where 255 is the largest possible")
     values = np.cumsum(record["values"], axis=-1, dtype=np.int16)
-    return Frames(
-        np.cumsum(record["sequence"], dtype=np.int64),
-        np.cumsum(record["device_time"], dtype=np.int64),
-        flags.astype(np.uint8),
-        np.ascontiguousarray(np.moveaxis(values, -1, 0)),
-    )
+    number, time = (np.cumsum(record[name], dtype=np.int64) for name in ("sequence", "device_time"))
+    return Frames(number, time, flags.astype(np.uint8), np.ascontiguousarray(np.moveaxis(values, -1, 0)))
 
 
 def _states(record: Any, count: int) -> np.ndarray:
@@ -320,7 +311,7 @@ def _message_layout(
     if name in _COUNTS:
         sizes[_COUNTS[name][0]] = count
     fixed: dict[str, Any] = {"cdr": list(CDR)}
-    fields: list[tuple[str, str, tuple[int, ...]]] = [("cdr", "u1", (4,))]
+    fields: list[tuple[str, Any, tuple[int, ...]]] = [("cdr", "u1", (4,))]
     for line in SCHEMAS[name].splitlines():
         kind, field = line.split()[:2]
         base, _, size = kind.partition("[")
@@ -331,7 +322,7 @@ def _message_layout(
             fields.append((f"{field}_length", "<u4", ()))
         elif field in sizes:
             fixed[field] = sizes[field]
-        fields.append((field, _TYPES[base], shape))
+        fields.append((field, np.dtype(base).newbyteorder("<"), shape))  # both have the same names
     dtype = np.dtype(fields)
     blank = np.zeros((), dtype)
     for field, value in fixed.items():

@@ -143,11 +143,8 @@ class CsvFile:
 
     def absences(self, wanted: Sequence[tuple[str, str]]) -> list[InputError]:
         """Errors for (column, configuration key) pairs whose column is missing, or there more than once."""
-        errors = [
-            missing_error(self.top, "column", name, self.full, key)
-            for name, key in wanted
-            if name not in self._places
-        ]
+        absent = [pair for pair in wanted if pair[0] not in self._places]
+        errors = [missing_error(self.top, "column", name, self.full, key) for name, key in absent]
         for name in dict.fromkeys(name for name, _ in wanted):
             if max(self.names.count(name), self.full.count(name)) > 1:
                 errors.append(InputError(self.top, f"several columns are called {name!r}", "every name once"))
@@ -155,12 +152,8 @@ class CsvFile:
 
     def numbered(self, prefix: str) -> dict[int, int]:
         """Columns prefix0, prefix1, ...: their numbers in increasing order, and their positions."""
-        numbers = {
-            int(name[len(prefix) :]): place
-            for place, name in enumerate(self.names)
-            if name.startswith(prefix) and name[len(prefix) :].isdecimal()
-        }
-        return dict(sorted(numbers.items()))
+        ends = ((name[len(prefix) :], at) for at, name in enumerate(self.names) if name.startswith(prefix))
+        return dict(sorted((int(end), at) for end, at in ends if end.isdecimal()))
 
     def block(self, prefix: str, unit: str | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The numbered columns in order: values [N, B], in m if they have a unit; fault [N, B]."""
@@ -201,9 +194,8 @@ def read_csv(path: Path, clock: str | None = None, names: Sequence[str] = ()) ->
         values, dates = _cells(text, separator, fault)
     bare, units = zip(*map(split_unit, full), strict=True)
     count = Counter(bare) + Counter(full)
-    plain = tuple(
-        short if count[short] == 1 + (short == name) else name for name, short in zip(full, bare, strict=True)
-    )
+    pairs = zip(full, bare, strict=True)
+    plain = tuple(short if count[short] == 1 + (short == name) else name for name, short in pairs)
     return CsvFile(path, line, separator, full, plain, units, values, fault, dates,
                    np.array(rows) + 1, content, clock)  # fmt: skip
 

@@ -395,9 +395,8 @@ def _absurd(
     named = {"time": "times in seconds", "length": "odometry in metres", "angle": "odometry in radians"}
     limit = {"time": "interval", "length": "speed", "angle": "turn_rate"}
     if units := _explanation(robot, held, limits):
-        typical = (
-            f"typically {robot.interval:.3g} s a step, {robot.speed:.4g} m/s and {robot.turn_rate:.4g} rad/s"
-        )
+        speeds = f"{robot.speed:.4g} m/s and {robot.turn_rate:.4g} rad/s"
+        typical = f"typically {robot.interval:.3g} s a step, {speeds}"
         parts = [f"these are {WORDS[unit].split()[0]}: {cures(key, unit)}" for key, unit in units.items()]
         for key in units:
             yield faults.get(key, typical), named[key], "; ".join([*parts, _else(limit[key], limits)])

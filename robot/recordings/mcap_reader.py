@@ -386,9 +386,8 @@ class Recording(ClosedSource):
             return f"{self.path}, row {row + self._first}"
 
         errors = nonfinite_errors(time, "time", place) + clock_errors(time, "time", place, moved)
-        errors += nonfinite_errors(motion, "odometry", place, most=1e6) + view_errors(
-            low, high, "view", place
-        )
+        errors += nonfinite_errors(motion, "odometry", place, most=1e6)
+        errors += view_errors(low, high, "view", place)
         errors += nonfinite_errors(odd, "a number in the reading", place)
         errors += nonfinite_errors(truth, "truth", place, has_truth > 0)
         dt = motion[:, 3]

@@ -122,9 +122,8 @@ def _value_errors(
         # Place ids are integers; relative angles of matches are not supported.
         ids, relative = np.nan_to_num(view).T
         bad = seen & ((ids < 0) | (ids != np.round(ids)) | (ids > np.iinfo(np.int32).max))
-        errors += first_error(
-            bad, place, lambda row: f"in_view's place id is {ids[row]}", "an integer from 0"
-        )
+        found = lambda row: f"in_view's place id is {ids[row]}"  # noqa: E731
+        errors += first_error(bad, place, found, "an integer from 0")
         found = lambda row: f"in_view's relative angle is {relative[row]} rad"  # noqa: E731
         turned, cure = seen & (relative != 0), "relative angles are not supported"
         errors += first_error(turned, place, found, "0", cure)

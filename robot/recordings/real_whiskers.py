@@ -85,10 +85,8 @@ def _source(
 
 WHISKERS = (*(f"left{k}" for k in range(8)), *(f"right{k}" for k in range(6)))
 """Names of the whiskers of the reach, in the order of the columns."""
-COLUMNS = (
-    *("row", "ee_x_m", "ee_y_m", "ee_z_m", "q0", "q1", "q2", "q3"),
-    *(f"{whisker}_{axis}" for whisker in WHISKERS for axis in "xyz"),
-)
+COLUMNS: tuple[str, ...] = ("row", "ee_x_m", "ee_y_m", "ee_z_m", "q0", "q1", "q2", "q3")
+COLUMNS += tuple(f"{whisker}_{axis}" for whisker in WHISKERS for axis in "xyz")
 
 
 class ReachRecord(NamedTuple):

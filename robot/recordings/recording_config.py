@@ -46,11 +46,8 @@ class RecordingConfig(StretchConfig):
             for key in ("views", "contacts", "labels", "pairs", "truth")
             if (part := getattr(self.table, key)) is not None and part.file is not None
         }
-        beside = {
-            key: _companion(recording, folder, file)
-            for key in ("stamps", "odometry")
-            if (file := getattr(self.video, key)) is not None
-        }
+        given = [key for key in ("stamps", "odometry") if getattr(self.video, key) is not None]
+        beside = {key: _companion(recording, folder, getattr(self.video, key)) for key in given}
         table, video = self.table.model_copy(update=parts), self.video.model_copy(update=beside)
         return self.model_copy(update={"file": recording, "table": table, "video": video})
 
@@ -61,9 +58,6 @@ def _companion(recording: Path, folder: Path, file: Path) -> Path:
         return folder / file
     before, after = file.name.split("*")
     beside = recording.parent / file.parent
-    found = [
-        path
-        for path in beside.glob(file.name)
-        if recording.name.startswith(path.name[len(before) : -len(after) or None])
-    ]
+    star = slice(len(before), -len(after) or None)
+    found = [path for path in beside.glob(file.name) if recording.name.startswith(path.name[star])]
     return max(found, key=lambda path: len(path.name), default=beside / file.name)

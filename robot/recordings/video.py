@@ -289,9 +289,8 @@ def video_frames(
     if warn is not None and count < announced:
         warn(f"{path}: only {count} of {announced} frames can be read")
     if stamps is not None and count != len(stamps.lines):
-        raise InputError(
-            str(stamps.path), f"{len(stamps.lines)} times", f"{count}, one for each frame of {path}"
-        )
+        expected = f"{count}, one for each frame of {path}"
+        raise InputError(str(stamps.path), f"{len(stamps.lines)} times", expected)
 
 
 @contextmanager

@@ -37,9 +37,8 @@ def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
         moments = stamps.column(video.time, "time")
         raise_errors(stamps.judge([video.time])[1] + clock_errors(moments, video.time, stamps.place))
     visual = config.visual_odometry if wheels is None else None
-    time, view, motion = camera_rows(
-        video_frames(path, video, stamps, judge.warn), config.image, visual, str(path)
-    )
+    frames = video_frames(path, video, stamps, judge.warn)
+    time, view, motion = camera_rows(frames, config.image, visual, str(path))
     digest = digest_of([path, b"" if stamps is None else stamps.content])
     inside = judge.stretch.rows(time, str(path))
     time, view = time[inside], view[inside]
@@ -83,9 +82,8 @@ def _contradictions(config: RecordingConfig) -> list[InputError]:
     if video.odometry is not None:
         return errors
     if config.visual_odometry is None:
-        cure = (
-            "set visual_odometry.fov_deg to the camera's horizontal field of view, or video.odometry to a CSV"
-        )
+        angle = "set visual_odometry.fov_deg to the camera's horizontal field of view"
+        cure = f"{angle}, or video.odometry to a CSV"
         errors.append(InputError(where, "no odometry", "visual odometry or wheel odometry", cure))
     given = [key for key in (*ODOMETRY, "labels", "pairs") if getattr(table, key) is not None]
     if given:

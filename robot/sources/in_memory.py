@@ -71,13 +71,13 @@ class InMemorySource(ClosedSource):
         return len(self.time)
 
     def __iter__(self) -> Iterator[Sample]:
-        shape, alive = self.view_shape, np.broadcast_to(self.alive, (self.length, self.whiskers))
+        shape, count = self.view_shape, self.whiskers
+        alive = np.broadcast_to(self.alive, (self.length, count))
         columns = (self.time.tolist(), self.motion, self.views, self.seen, self.label)
         for row, (time, motion, view, seen, label) in enumerate(zip(*columns, strict=True)):
             picture = view if seen else None
-            reading = observation(
-                Odometry(*motion), picture, view_shape=shape, label=label, whiskers=self.whiskers
-            )._replace(alive=alive[row].copy())
+            reading = observation(Odometry(*motion), picture, view_shape=shape, label=label, whiskers=count)
+            reading = reading._replace(alive=alive[row].copy())
             if self.contact is not None and self.point is not None:
                 reading = reading._replace(contact=self.contact[row].copy(), point=self.point[row].copy())
             known = self.truth is not None and not np.isnan(self.truth[row]).any()

@@ -51,9 +51,8 @@ def from_motions(
     Args:
         time: [N] s. forward, left: [N] m in the body frame. turn: [N] rad, counter-clockwise.
     """
-    motion = np.stack(
-        [*_turned(forward, left, MIDPOINT * turn), turn, np.diff(time, prepend=time[:1])], axis=-1
-    )
+    dt = np.diff(time, prepend=time[:1])
+    motion = np.stack([*_turned(forward, left, MIDPOINT * turn), turn, dt], axis=-1)
     motion[:1] = 0.0
     return motion
 
@@ -128,10 +127,8 @@ def correct_observations(
     """Observations with the odometry corrected."""
     motions = np.array([observation.odometry[:3] for observation in observations]).reshape(-1, 3)
     corrected = correct_motions(correction, replace_steps(correction, motions))
-    return [
-        observation._replace(odometry=Odometry(dx, dy, dtheta, observation.odometry.dt))
-        for observation, (dx, dy, dtheta) in zip(observations, corrected, strict=True)
-    ]
+    pairs = zip(observations, corrected, strict=True)
+    return [each._replace(odometry=Odometry._make([*motion, each.odometry.dt])) for each, motion in pairs]
 
 
 def correct_odometry(source: Source, correction: OdometryCorrection) -> Source:

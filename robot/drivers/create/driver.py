@@ -311,19 +311,13 @@ class CreateDriver:
         except Unplugged as error:
             last = str(error)
         if found is None:
-            raise NoAnswer(
-                port,
-                f"no valid reply ({last})",
-                f"replies of a Create at {protocol.BAUD} baud",
-                "switch it on, check cable and port; a Create 2 is not supported",
-            )
+            expected = f"replies of a Create at {protocol.BAUD} baud"
+            cure = "switch it on, check cable and port; a Create 2 is not supported"
+            raise NoAnswer(port, f"no valid reply ({last})", expected, cure)
         if found.bumps & Bumps.DROPPED or found.mode != protocol.Mode.SAFE:
-            raise NotSafe(
-                port,
-                f"the Create stays in {found.mode.name.lower()} mode, {found.bumps.describe()}",
-                "safe mode",
-                "set it on all its wheels, away from edges, and unplug its charger",
-            )
+            stays = f"the Create stays in {found.mode.name.lower()} mode, {found.bumps.describe()}"
+            cure = "set it on all its wheels, away from edges, and unplug its charger"
+            raise NotSafe(port, stays, "safe mode", cure)
 
     def _run(self) -> None:
         loop, guard = self._loop, self.watchdog

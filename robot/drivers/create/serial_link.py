@@ -81,11 +81,9 @@ def open_port(name: str, *, exclusive: bool = True) -> _SerialPort:
     except ImportError:
         raise InputError("serial", "pyserial is not installed", "", "pip install 'ratslam[live]'") from None
     # Without `exclusive` pyserial takes no lock; False is refused on Windows.
-    options = {"exclusive": True} if exclusive else {}
+    more = {"exclusive": True} if exclusive else {}
     try:
-        port: _SerialPort = serial.Serial(
-            name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **options
-        )
+        port: _SerialPort = serial.Serial(name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **more)
     except OSError as error:
         # The text of pyserial's error is the only place of most causes.
         cause = error.errno or getattr(error.__context__, "errno", None)
@@ -166,19 +164,16 @@ class SerialLink:
         self._port.close()
 
     def _accept(self, found: list[SensorReply], *, late: int, stray: int) -> None:
-        self._late_motion = (
-            self._late_motion[0] + sum(reply.millimetres for reply in found),
-            self._late_motion[1] + sum(reply.degrees for reply in found),
-        )
+        for reply in found:
+            millimetres, degrees = self._late_motion
+            self._late_motion = millimetres + reply.millimetres, degrees + reply.degrees
         self._count(good=len(found), late=late, stray=stray)
 
     def _rest(self) -> bytes:
         """All bytes until the line is quiet, at most those of one time-out."""
         self._port.timeout = QUIET
-        data = b""
-        while len(data) < protocol.BAUD // 10 * ANSWER and (
-            more := self._port.read(max(1, self._port.in_waiting))
-        ):
+        data, most = b"", protocol.BAUD // 10 * ANSWER
+        while len(data) < most and (more := self._port.read(max(1, self._port.in_waiting))):
             data += more
         return data
 

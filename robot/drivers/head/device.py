@@ -11,17 +11,10 @@ import json
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
+from robot.drivers.head import usb_protocol as wire
 from robot.drivers.head.driver_config import Address
 from robot.drivers.head.emulated_cable import SocketBackend
-from robot.drivers.head.usb_protocol import (
-    ENDPOINT_IN,
-    ENDPOINT_OUT,
-    INTERFACE,
-    MAX_ANSWER,
-    REQUEST_IN,
-    REQUEST_OUT,
-    Request,
-)
+from robot.drivers.head.usb_protocol import Request
 from tactile.base.errors import InputError
 
 T = TypeVar("T")
@@ -63,10 +56,8 @@ class HeadIdentity(NamedTuple):
             size = int(fields["whiskers"]), int(fields["channels"])
             return cls(str(fields["name"]), str(fields["version"]), *size, float(fields["rate"]))
         except (ValueError, KeyError, TypeError):
-            cure = "check the address, or the bridge's firmware"
-            raise InputError(
-                "head", f"identity {answer[:80]!r}", "name, version, shape, rate", cure
-            ) from None
+            found, cure = f"identity {answer[:80]!r}", "check the address, or the bridge's firmware"
+            raise InputError("head", found, "name, version, shape, rate", cure) from None
 
 
 def open_bridge(address: str) -> Bridge:
@@ -112,26 +103,26 @@ class Bridge:
             device.set_configuration()
         from usb import util
 
-        util.claim_interface(device, INTERFACE)
+        util.claim_interface(device, wire.INTERFACE)
 
     def read(self, size: int, timeout: float) -> bytes:
         """Reads at most `size` bytes of the stream; none if none arrive within `timeout` s."""
         patience = max(1, round(1000 * timeout))
-        got = self._try(lambda: self._device.read(ENDPOINT_IN, size, patience), ENDPOINT_IN)
+        got = self._try(lambda: self._device.read(wire.ENDPOINT_IN, size, patience), wire.ENDPOINT_IN)
         return b"" if got is None else got.tobytes()
 
     def write(self, data: bytes) -> None:
         """Sends a command."""
-        if self._try(lambda: self._device.write(ENDPOINT_OUT, data, TIMEOUT), ENDPOINT_OUT) is None:
+        if self._try(lambda: self._device.write(wire.ENDPOINT_OUT, data, TIMEOUT), wire.ENDPOINT_OUT) is None:
             raise Stalled(errno.ETIMEDOUT, "commands are not accepted")
 
     def request(self, request: Request) -> bytes:
         """Sends a control request and returns the answer; `Stalled` if it is unknown or not answered."""
+        kind = wire.REQUEST_IN
+        content: int | bytes = 8 if request == Request.CLOCK else wire.MAX_ANSWER  # size of the answer
         if request in (Request.START, Request.STOP):
-            answer = self._try(lambda: self._device.ctrl_transfer(REQUEST_OUT, request, 0, 0, b"", TIMEOUT))
-        else:
-            size = 8 if request == Request.CLOCK else MAX_ANSWER
-            answer = self._try(lambda: self._device.ctrl_transfer(REQUEST_IN, request, 0, 0, size, TIMEOUT))
+            kind, content = wire.REQUEST_OUT, b""
+        answer = self._try(lambda: self._device.ctrl_transfer(kind, request, 0, 0, content, TIMEOUT))
         if answer is None:
             raise Stalled(errno.ETIMEDOUT, f"no answer to {request.name}")
         return b"" if isinstance(answer, int) else answer.tobytes()

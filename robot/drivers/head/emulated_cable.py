@@ -160,34 +160,27 @@ class SocketBackend:
         """Returns None: the device has no parent."""
 
     def get_device_descriptor(self, dev: bytes) -> SimpleNamespace:
-        names = (
-            "bLength bDescriptorType bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol bMaxPacketSize0 "
-            "idVendor idProduct bcdDevice iManufacturer iProduct iSerialNumber bNumConfigurations"
-        )
+        names = "bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol bMaxPacketSize0 idVendor idProduct "
+        names += "bcdDevice iManufacturer iProduct iSerialNumber bNumConfigurations"
         whereabouts = {"bus": 1, "address": 1, "port_number": 1, "port_numbers": (1,), "speed": 3}
         return _descriptor("<BBHBBBBHHHBBBB", names, dev, **whereabouts)
 
     def get_configuration_descriptor(self, dev: bytes, config: int) -> SimpleNamespace:
         _require_first(config)
-        names = (
-            "bLength bDescriptorType wTotalLength bNumInterfaces bConfigurationValue iConfiguration "
-            "bmAttributes bMaxPower"
-        )
+        names = "wTotalLength bNumInterfaces bConfigurationValue iConfiguration bmAttributes bMaxPower"
         return _descriptor("<BBHBBBBB", names, _descriptors(dev, 2)[0])
 
     def get_interface_descriptor(self, dev: bytes, intf: int, alt: int, config: int) -> SimpleNamespace:
         _require_first(intf, alt, config)
-        names = (
-            "bLength bDescriptorType bInterfaceNumber bAlternateSetting bNumEndpoints bInterfaceClass "
-            "bInterfaceSubClass bInterfaceProtocol iInterface"
-        )
+        names = "bInterfaceNumber bAlternateSetting bNumEndpoints bInterfaceClass bInterfaceSubClass "
+        names += "bInterfaceProtocol iInterface"
         return _descriptor("<9B", names, _descriptors(dev, 4)[0])
 
     def get_endpoint_descriptor(
         self, dev: bytes, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
         _require_first(intf, alt, config)
-        names = "bLength bDescriptorType bEndpointAddress bmAttributes wMaxPacketSize bInterval"
+        names = "bEndpointAddress bmAttributes wMaxPacketSize bInterval"
         return _descriptor("<BBBBHB", names, _descriptors(dev, 5)[ep], bRefresh=0, bSynchAddress=0)
 
     def open_device(self, dev: bytes) -> _Handle:
@@ -290,7 +283,8 @@ def _descriptors(dev: bytes, kind: int) -> list[bytes]:
 
 
 def _descriptor(layout: str, names: str, data: bytes, **more: Any) -> SimpleNamespace:
-    """A descriptor as pyusb reads it: its fields by name."""
+    """A descriptor as pyusb reads it: its length and kind, and the fields of these names."""
+    names = f"bLength bDescriptorType {names}"
     fields = dict(zip(names.split(), struct.unpack_from(layout, data), strict=True))
     return SimpleNamespace(**fields, **more, extra_descriptors=[])
 

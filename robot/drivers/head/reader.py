@@ -82,9 +82,8 @@ class HeadReader:
         self.identity: HeadIdentity | None = None
         self.stalls = 0
         self._connect, self._whiskers, self._on_overload = connect, whiskers, on_overload
-        self._overload = OverloadDetector(
-            config.overload, np.ones(whiskers, bool) if alive is None else alive
-        )
+        checked = np.ones(whiskers, bool) if alive is None else alive
+        self._overload = OverloadDetector(config.overload, checked)
         self._queue = _CommandQueue()
         self._ending, self._tried = threading.Event(), threading.Event()
         self._refusal: Exception | None = None

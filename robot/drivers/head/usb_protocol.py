@@ -135,12 +135,8 @@ class Command(NamedTuple):
         if len(packet) < COMMAND_SIZE or zlib.crc32(packet[:-4]) != int.from_bytes(packet[-4:], "little"):
             return None
         magic, version, kind, mode, count, *drive = _COMMAND.unpack_from(packet)
-        known = (
-            magic == COMMAND_MAGIC
-            and version == VERSION
-            and kind in set(CommandKind)
-            and mode in set(FeedbackMode)
-        )
+        ours = magic == COMMAND_MAGIC and version == VERSION
+        known = ours and kind in set(CommandKind) and mode in set(FeedbackMode)
         if not known or len(packet) != COMMAND_SIZE + 2 * count or not np.isfinite(drive).all():
             return None
         numbers = np.frombuffer(packet, "<i2", count, _COMMAND.size).astype(np.int16)

@@ -7,17 +7,10 @@ from typing import Literal
 
 import numpy as np
 
+from robot.drivers.head import usb_protocol as wire
 from robot.drivers.head.decoder import Frames
 from robot.drivers.head.reader import HeadReader
-from robot.drivers.head.usb_protocol import (
-    ANGLE,
-    NO_THRESHOLD,
-    Command,
-    CommandKind,
-    FeedbackMode,
-    FrameFlag,
-    to_counts,
-)
+from robot.drivers.head.usb_protocol import Command, CommandKind, FeedbackMode, FrameFlag, to_counts
 from tactile.base.errors import InputError
 from tactile.whisker_geometry import Head
 from tactile.whisking import WhiskingConfig, check_amplitude, initial_drive, whisk_command, whisk_phase
@@ -46,17 +39,12 @@ def whisk_commands(
     numbers = np.zeros(0, np.int16)
     if threshold is not None:
         finite = np.isfinite(threshold)
-        counts = np.minimum(to_counts(np.where(finite, threshold, 0.0)), NO_THRESHOLD - 1)
-        numbers = np.where(finite, counts, NO_THRESHOLD).astype(np.int16)
-    drive = Command(
-        CommandKind.DRIVE,
-        FeedbackMode.RCP if in_head else FeedbackMode.OPEN,
-        amplitude=float(np.radians(whisking.amplitude_deg)),
-        frequency=whisking.rate,
-        gain=whisking.gain,
-        window=whisking.window,
-        numbers=numbers,
-    )
+        counts = np.minimum(to_counts(np.where(finite, threshold, 0.0)), wire.NO_THRESHOLD - 1)
+        numbers = np.where(finite, counts, wire.NO_THRESHOLD).astype(np.int16)
+    mode = FeedbackMode.RCP if in_head else FeedbackMode.OPEN
+    amplitude, frequency = float(np.radians(whisking.amplitude_deg)), whisking.rate
+    law = amplitude, frequency, whisking.gain, whisking.window
+    drive = Command(CommandKind.DRIVE, mode, *law, numbers=numbers)
     return [drive] if centre is None else [Command(CommandKind.CENTRE, numbers=to_counts(centre)), drive]
 
 
@@ -83,7 +71,7 @@ class HostRcp:
 
         They are sent in every cycle, since a late command of the previous cycle may have arrived in this one.
         """
-        y = frames.values[..., 2] * ANGLE - self._centre
+        y = frames.values[..., 2] * wire.ANGLE - self._centre
         for time, flags, deflection in zip(frames.time.tolist(), frames.flags.tolist(), y, strict=True):
             if flags & FrameFlag.CYCLE:
                 self._began = time

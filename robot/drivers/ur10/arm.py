@@ -47,22 +47,13 @@ class _ArmProcess:
     def __init__(self, shared: int, config: ArmConfig) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         paths = [str(Path(__file__).parents[3]), *filter(None, [os.environ.get("PYTHONPATH")])]
-        environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(paths),
-            "OMP_NUM_THREADS": "1",
-            "OPENBLAS_NUM_THREADS": "1",
-        }
-        module = "robot.drivers.ur10.rtde_process"
+        env = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+        env |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        module, pipe = "robot.drivers.ur10.rtde_process", subprocess.PIPE
+        command = [sys.executable, "-m", module, str(shared), config.model_dump_json()]
         with withheld_signals():
             self._process = subprocess.Popen(
-                [sys.executable, "-m", module, str(shared), config.model_dump_json()],
-                pass_fds=[shared],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._errors,
-                bufsize=0,
-                env=environment,
+                command, pass_fds=[shared], stdin=pipe, stdout=pipe, stderr=self._errors, bufsize=0, env=env
             )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -134,8 +125,6 @@ PROCESS_LOST = {
 """Outcomes after which the RTDE process may not react: it is killed."""
 PendingMove = tuple[int, Move, float]
 """A move in progress: number of the command, the move as planned, and its deadline, s, host's clock."""
-SAFETY_STOPS = {SessionOutcome.PROTECTIVE_STOP, SessionOutcome.SAFEGUARD_STOP, SessionOutcome.EMERGENCY_STOP}
-"""Outcomes after which a controller may resume its program: the program is ended."""
 
 
 class Arm:
@@ -276,7 +265,7 @@ class Arm:
                 # Without the process no state shows the standstill; the controller's watchdog times out too.
                 self._stop_by = None
                 self._stop_by_dashboard()
-            elif outcome in SAFETY_STOPS:
+            elif outcome in safety.SAFETY_STOPS:
                 self._stop_by_dashboard()
             self._retreat_pending = outcome is SessionOutcome.CONTACT
 
@@ -293,11 +282,8 @@ class Arm:
             if ended is not None:
                 raise StartupRefused(ended.detail, "", "check the controller's ports 30003 and 30004")
             if time.monotonic() > patience:
-                raise StartupRefused(
-                    f"the controller did not start the control script in {self.config.connect:g} s",
-                    "",
-                    "check the pendant: remote control on, no message waiting",
-                )
+                found = f"the controller did not start the control script in {self.config.connect:g} s"
+                raise StartupRefused(found, "", "check the pendant: remote control on, no message waiting")
             time.sleep(TICK)
 
     def _kill_process(self) -> None:
@@ -401,9 +387,7 @@ class Arm:
     def _order(self, do: str, target: np.ndarray, speed: float) -> int:
         """Sends a command that the next stop revokes; returns its number."""
         self._number += 1
-        stops = int(self.shared.control["stops"])
+        stops, place = int(self.shared.control["stops"]), target.tolist()
         if self.process is not None:
-            self.process.send(
-                do=do, number=self._number, target=target.tolist(), speed=float(speed), stops=stops
-            )
+            self.process.send(do=do, number=self._number, target=place, speed=float(speed), stops=stops)
         return self._number

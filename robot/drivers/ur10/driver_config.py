@@ -162,8 +162,6 @@ class ArmConfig(Settings):
     def _stops_in_time(self) -> ArmConfig:
         slow = self.stale > 1 or self.heartbeat > 1 or self.watchdog_hz < 2
         if slow and not self.emulated:
-            raise ValueError(
-                "`stale` and `heartbeat` are at most 1 s, and `watchdog_hz` is at least 2 Hz, except for an "
-                "emulator at a loopback address"
-            )
+            limits = "`stale` and `heartbeat` are at most 1 s, and `watchdog_hz` is at least 2 Hz"
+            raise ValueError(f"{limits}, except for an emulator at a loopback address")
         return self

@@ -36,13 +36,7 @@ from robot.drivers.ur10.shared_state import ARM_STATE, SharedState
 from tactile.base.errors import InputError
 
 MAX_MISSING_STATES = 3  # state periods without a state before an interruption is certain
-SCRIPT_UNUSABLE = {
-    SessionOutcome.ARM_GONE,
-    SessionOutcome.HOST_LATE,
-    SessionOutcome.PROTECTIVE_STOP,
-    SessionOutcome.SAFEGUARD_STOP,
-    SessionOutcome.EMERGENCY_STOP,
-}
+SCRIPT_UNUSABLE = safety.SAFETY_STOPS | {SessionOutcome.ARM_GONE, SessionOutcome.HOST_LATE}
 """Outcomes after which the control script gets no more commands: its watchdog times out and ends it."""
 
 
@@ -223,7 +217,7 @@ class _RtdeProcess:
         """Runs until the session has ended."""
         began = time.monotonic()
         threading.Thread(target=self.commands.run, daemon=True).start()
-        period = 0.25 / self.config.hz
+        period, longest = 0.25 / self.config.hz, MAX_MISSING_STATES / self.config.hz
         lateness = LatenessMeter(period, began)
         while True:
             stands = self.commands.leaving and self.commands.stops_sent and safety.at_rest(self._state)
@@ -237,10 +231,7 @@ class _RtdeProcess:
                 if self._settled and self._state["runtime"] != PLAYING:
                     unreset, late = self.commands.unreset(now), float(self.shared.control["late"])
                     self.commands.hold(safety.ended_script_finding(self.config, unreset, late))
-            elif (
-                now - self._state["host"] > MAX_MISSING_STATES / self.config.hz
-                and not self.receive.isConnected()
-            ):
+            elif now - self._state["host"] > longest and not self.receive.isConnected():
                 self.commands.hold(Finding(SessionOutcome.ARM_GONE, "the controller closed the connection"))
             if not self._settled and self.shared.newest and now - began > REST_TIME:
                 # The median force is that at rest, without contact.

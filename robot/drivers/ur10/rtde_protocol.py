@@ -25,17 +25,8 @@ HEADER = struct.Struct(">HB")
 PROTOCOL, CONTROLLER, TEXT = ord("V"), ord("v"), ord("M")
 OUTPUTS, INPUTS, START, PAUSE, DATA = ord("O"), ord("I"), ord("S"), ord("P"), ord("U")
 
-CODES = {
-    "BOOL": "?",
-    "UINT8": "B",
-    "UINT32": "I",
-    "INT32": "i",
-    "UINT64": "Q",
-    "DOUBLE": "d",
-    "VECTOR3D": "3d",
-    "VECTOR6D": "6d",
-    "VECTOR6INT32": "6i",
-}
+CODES = {"BOOL": "?", "UINT8": "B", "UINT32": "I", "INT32": "i", "UINT64": "Q", "DOUBLE": "d"}
+CODES |= {"VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i"}
 REGISTERS = 48
 _REGISTER = {"int_register": "INT32", "double_register": "DOUBLE"}
 

@@ -37,6 +37,8 @@ SAFETY_BITS = (
     (1 << 9, SessionOutcome.PROTECTIVE_STOP, "the controller reports a safety fault"),
     (1 << 10, SessionOutcome.PROTECTIVE_STOP, "the controller stopped for safety"),
 )
+SAFETY_STOPS = {outcome for _, outcome, _ in SAFETY_BITS}
+"""Outcomes after which a controller may resume its program: the program is ended."""
 
 
 class TargetRefused(ValueError):
@@ -91,16 +93,14 @@ def check_target(config: ArmConfig, target: Any, from_tcp: Any) -> np.ndarray:
         raise TargetRefused(f"{_place(target)} lies outside the box {_box(config)}")
     if math.hypot(*target[3:]) > 2 * np.pi:
         raise TargetRefused(f"a rotation vector is at most one turn long: {target[3:].tolist()}")
-    if np.degrees(tcp_tilt(target)) > config.tilt_deg + ROUNDING:
-        raise TargetRefused(
-            f"the tool would lean {np.degrees(tcp_tilt(target)):.1f} degrees from straight down; "
-            f"{config.tilt_deg:g} are allowed"
-        )
+    lean = np.degrees(tcp_tilt(target))
+    if lean > config.tilt_deg + ROUNDING:
+        allowed = f"{config.tilt_deg:g} are allowed"
+        raise TargetRefused(f"the tool would lean {lean:.1f} degrees from straight down; {allowed}")
     start = np.asarray(from_tcp, np.float64)
     if start.shape != (6,) or not np.isfinite(start).all() or not config.box.contains(start):
-        raise TargetRefused(
-            f"the tool stands at {_place(start)}, outside the box {_box(config)}: bring it in by hand"
-        )
+        found = f"the tool stands at {_place(start)}, outside the box {_box(config)}"
+        raise TargetRefused(f"{found}: bring it in by hand")
     return target
 
 
@@ -137,9 +137,8 @@ def check_command(config: ArmConfig, target: Any, from_tcp: Any, commanded: floa
     short = way <= max(config.speed**2 / config.acceleration, MOVED_ON) + MOVED_ON
     most = max(config.speed, config.turn_rate / config.turn_ratio) if short else config.speed
     if not (isinstance(commanded, float | int) and 0 < commanded <= min(most, SPEED_CAP)):
-        raise TargetRefused(
-            f"a commanded speed of {commanded!r} m/s over {way:.3f} m; at most {most:g} is allowed"
-        )
+        found = f"a commanded speed of {commanded!r} m/s over {way:.3f} m"
+        raise TargetRefused(f"{found}; at most {most:g} is allowed")
     return target
 
 
@@ -179,18 +178,16 @@ def check_state(
     if not np.isfinite(numbers).all():
         return after, Finding(SessionOutcome.ARM_MALFORMED, "a state has values that are not finite")
     if np.abs(state["tcp"][:3]).max() > REACH or np.abs(state["joints"]).max() > JOINT_RANGE:
-        return after, Finding(
-            SessionOutcome.ARM_MALFORMED, f"an impossible state: tool at {_place(state['tcp'])}"
-        )
+        found = f"an impossible state: tool at {_place(state['tcp'])}"
+        return after, Finding(SessionOutcome.ARM_MALFORMED, found)
     if state["robot"] <= watch[1]:
         return after, Finding(SessionOutcome.CLOCK_JUMPED, "the controller's clock went back")
     for bits, outcome, text in SAFETY_BITS:
         if int(state["safety"]) & bits:
             return after, Finding(outcome, text)
     if not config.box.contains(state["tcp"]):
-        return after, Finding(
-            SessionOutcome.OUT_OF_BOX, f"{_place(state['tcp'])} lies outside the box {_box(config)}"
-        )
+        found = f"{_place(state['tcp'])} lies outside the box {_box(config)}"
+        return after, Finding(SessionOutcome.OUT_OF_BOX, found)
     if loaded >= MIN_LOADED:
         return after, Finding(SessionOutcome.CONTACT, f"{force:.0f} N at the tool at {_place(state['tcp'])}")
     return after, None
@@ -260,9 +257,8 @@ def ended_script_finding(config: ArmConfig, unreset: float, late: float) -> Find
     if late < EXPLAINED_SHARE * limit and not config.emulated:
         return Finding(SessionOutcome.ARM_GONE, detail)
     # An emulated controller answers late because this machine is.
-    return Finding(
-        SessionOutcome.HOST_LATE, f"this machine was {max(late, unreset - limit):.3f} s late: {detail}"
-    )
+    late = max(late, unreset - limit)
+    return Finding(SessionOutcome.HOST_LATE, f"this machine was {late:.3f} s late: {detail}")
 
 
 MIN_RATE_SHARE = 0.9  # share of the nominal state rate that is required
@@ -292,9 +288,8 @@ def check_controller(config: ArmConfig) -> dashboard.ControllerStatus:
                     time.sleep(0.3)
                     controller = connection.controller()
     except dashboard.DashboardSilent as silent:
-        raise StartupRefused(
-            str(silent), "", "check the cable, the address and that the controller is on"
-        ) from None
+        cure = "check the cable, the address and that the controller is on"
+        raise StartupRefused(str(silent), "", cure) from None
     version, mode, safety, program, remote = controller
     polyscope = f"PolyScope {'.'.join(map(str, version))}"
     faulty, local = safety not in ("NORMAL", "REDUCED"), remote is False
@@ -328,11 +323,8 @@ def check_states(config: ArmConfig, states: Callable[[], np.ndarray]) -> None:
         if not rate < MIN_RATE_SHARE * config.hz:
             break
         if time.monotonic() > until:
-            raise StartupRefused(
-                f"stream at {rate:.0f} of {config.hz} Hz",
-                "",
-                "a CB3 has 125 Hz only; check the network and the load of this machine",
-            )
+            cure = "a CB3 has 125 Hz only; check the network and the load of this machine"
+            raise StartupRefused(f"stream at {rate:.0f} of {config.hz} Hz", "", cure)
         time.sleep(0.05)
     here = states()[-1]["tcp"]
     if not config.box.contains(here):

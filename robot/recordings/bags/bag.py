@@ -9,6 +9,7 @@ from __future__ import annotations
 import bz2
 import io
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from copy import copy
@@ -290,9 +291,8 @@ class Bag:
         where = f"{self.path}, {topic.name}"
         if topic.kind not in self._store.fielddefs:
             raise InputError(where, f"messages of type {topic.kind}", "a type that ROS itself defines")
-        connections = [
-            each for reader in self._readers for each in reader.connections if each.topic == topic.name
-        ]
+        everywhere = [each for reader in self._readers for each in reader.connections]
+        connections = [each for each in everywhere if each.topic == topic.name]
         coded = {getattr(each.ext, "serialization_format", "cdr") for each in connections} - {"cdr"}
         if coded:
             raise InputError(where, f"messages encoded as {', '.join(coded)}", "CDR, of ROS 2", CONVERT)
@@ -363,11 +363,8 @@ def _storages(reader: Any) -> list[Any]:
         part.chunks.clear()
         part.connections.clear()
         part.meta_scan()
-        counts = part.statistics.channel_message_counts
-        part.connections = [
-            each._replace(msgcount=max(counts.get(each.id, 0), before.get(each.id, 0)))
-            for each in part.connections
-        ]
+        counts = Counter(part.statistics.channel_message_counts) | Counter(before)  # the larger ones
+        part.connections = [each._replace(msgcount=counts[each.id]) for each in part.connections]
     return found
 
 

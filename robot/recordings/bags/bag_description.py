@@ -353,6 +353,4 @@ def _headers_serve(topics: Sequence[TopicDescription]) -> bool:
     if not all(times.in_order and not times.leaps - times.backwards for times in stamped):
         return False
     clocks: list[Times] = [topic.stamped or topic.received for topic in topics]
-    return not clocks or bool(
-        np.max([times.first for times in clocks]) <= np.min([times.last for times in clocks])
-    )
+    return not clocks or max(times.first for times in clocks) <= min(times.last for times in clocks)

@@ -138,15 +138,13 @@ def read_bag(settings: RecordingConfig, judge: InputJudge) -> InMemorySource:
     if views is not None:
         shape = (*views.values.shape[1:3], 1)
         whiskers = shape[0] * shape[1] if config.touch is not None else 0
-    errors = list[InputError]()
-    rows = blank_rows(path, odometry.time, odometry.values, shape)
+    errors, time = list[InputError](), odometry.time
+    rows = blank_rows(path, time, odometry.values, shape)
     if views is not None:
         part = config.views or config.touch
         errors += _place_views(bag, rows, views, part.tolerance if part else None)
     if truth is not None:
-        rows["truth"], faults = interpolated_poses(
-            odometry.time, truth.time, truth.values, "time", truth.where
-        )
+        rows["truth"], faults = interpolated_poses(time, truth.time, truth.values, "time", truth.where)
         errors += faults
     source = InMemorySource(digest=digest_of(bag_files(path)), alive=np.ones(whiskers, bool), **rows)
     # The odometry is judged: only the truth is compared.

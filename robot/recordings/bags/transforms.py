@@ -12,15 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.recordings.bags.bag import (
-    OTHER_CLOCK,
-    TRANSFORMS,
-    Bag,
-    Series,
-    as_series,
-    in_seconds,
-    usable_stamps,
-)
+from robot.recordings.bags import bag as bags
+from robot.recordings.bags.bag import Bag, Series, as_series
 from robot.recordings.bags.topics_config import OdometryTopic, PoseTopic
 from robot.recordings.sanity_checks import leave_out, nonfinite_errors, still_axis
 from robot.sources.input_files import missing_error, raise_errors
@@ -132,7 +125,7 @@ def read_links(bag: Bag, name: str) -> Links:
     """
     links: Links = {}
     for topic in bag.topics.values():
-        if topic.kind not in TRANSFORMS or not topic.total or not f"/{topic.name}".endswith(name):
+        if topic.kind not in bags.TRANSFORMS or not topic.total or not f"/{topic.name}".endswith(name):
             continue
         where = f"{bag.path}, {topic.name}"
         spoilt, total, first = 0, 0, None
@@ -215,9 +208,9 @@ def _poses_between(bag: Bag, frames: tuple[str, str], role: str, plane: str) -> 
     times, errors = dict[tuple[str, str], np.ndarray](), list[InputError]()
     for pair in moving:
         place = f"{bag.path}, {MOVING} {' to '.join(pair)}"
-        use, faults = usable_stamps(bag, [stamp for stamp, *_ in links[pair]], place)
+        use, faults = bags.usable_stamps(bag, [stamp for stamp, *_ in links[pair]], place)
         links[pair] = list(compress(links[pair], use))
-        times[pair] = in_seconds([stamp for stamp, *_ in links[pair]])
+        times[pair] = bags.in_seconds([stamp for stamp, *_ in links[pair]])
         errors += faults
     lead = max(moving, key=lambda pair: len(times[pair]))
     moments, numbers = times[lead], np.array([number for *_, number in links[lead]])
@@ -324,7 +317,7 @@ def read_poses(bag: Bag, config: PoseTopic, role: str = "truth") -> Series:
 
     for number, time, content, value in bag.usable(topic, read):
         if value is not None:
-            stamps = (bag.stamp(content, time, each) for each in (bag.clock, OTHER_CLOCK[bag.clock]))
+            stamps = (bag.stamp(content, time, each) for each in (bag.clock, bags.OTHER_CLOCK[bag.clock]))
             rows.append((number, *stamps, frames_of(content), time))
             kept.append(value)
     if not rows:

@@ -335,10 +335,8 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str) -> Series:
     read = list(bag.stamped(topic, reader.view))
     rows = [row for row in read if row[2] is not None and row[2].covered >= _COVERED]
     empty = sum(view is None for *_, view in read)
-    for count, fault in (
-        (empty, "have no measured range"),
-        (len(read) - len(rows) - empty, "cover less than half of the sectors"),
-    ):
+    few = len(read) - len(rows) - empty
+    for count, fault in ((empty, "have no measured range"), (few, "cover less than half of the sectors")):
         if count:
             bag.warn(f"{where}: {count} of {topic.total} messages {fault} and are no views")
     if wider := reader.wider_span():
