@@ -25,7 +25,7 @@ from robot.drivers.ur10.driver_config import tcp_heading
 from robot.live.live_config import LiveConfig
 from robot.live.polling import TICK, OperatorStop, PolledRig, SessionFault, session_fault
 from robot.simulation.head.odometry_errors import OdometryErrors, motions_between
-from robot.sources.odometry import MIDPOINT, from_velocities
+from robot.sources.odometry import from_velocities
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap
 from tactile.base.types import Odometry
@@ -99,10 +99,9 @@ class ArmOdometry:
         heading = tcp_heading(tcp)
         c, s = np.cos(heading), np.sin(heading)
         forward, left = c * speed[:, 0] + s * speed[:, 1], -s * speed[:, 0] + c * speed[:, 1]
-        times = np.array([0.0, took])
         mean = [np.array([0.0, part.mean()]) for part in (forward, left, speed[:, 5])]
-        motion = from_velocities(times, mean[0], mean[1], mean[2], MIDPOINT)[1, :3]
-        return compose(start, motion)
+        motion = from_velocities(np.array([0.0, took]), mean[0], mean[1], mean[2])
+        return compose(start, motion[1, :3])
 
 
 MAX_REST_TIME, REST_TIME = 2.0, 0.3

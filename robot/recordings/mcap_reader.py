@@ -359,14 +359,12 @@ class Recording(ClosedSource):
         self.events = tuple(events)
         self.view_shape, self.whiskers = description.view_shape, description.whiskers
         self.info = description.info.model_copy(update={"raw_whiskers": raw_whiskers})
-        self.length = scanner.count
-        self.truncated = bool(scanner.broken)
-        self.warning = ""
-        if self.truncated:
-            self.warning = f"{path}: {self.length} samples are readable, the rest is lost: {scanner.broken}"
+        count, self.truncated, self.warning = scanner.count, bool(scanner.broken), ""
         if scanner.broken == UNCLOSED:
-            self.warning = f"{path}: {UNCLOSED}; all {self.length} samples are there that were written"
-        rows = np.frombuffer(columns).reshape(scanner.count, -1)
+            self.warning = f"{path}: {UNCLOSED}; all {count} samples are there that were written"
+        elif self.truncated:
+            self.warning = f"{path}: {count} samples are readable, the rest is lost: {scanner.broken}"
+        rows = np.frombuffer(columns).reshape(count, -1)
         inside = judge.stretch.rows(rows[:, 0], str(path))
         self._first, self._last = int(inside.argmax()), len(inside) - int(inside[::-1].argmax())
         self.length, self.digest = self._last - self._first, judge.stretch.digest(self.digest)
