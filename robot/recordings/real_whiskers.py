@@ -319,12 +319,9 @@ def read_contacts(path: Path) -> list[TaxelContact]:
         InputError: the file is missing, empty, cut or not of MATLAB, lacks the cell array, or a cell is
             empty, has other columns or values that are not finite.
     """
-    return _contacts(path, read_bytes(path))
-
-
-def _contacts(path: Path, content: bytes) -> list[TaxelContact]:
+    content = BytesIO(read_bytes(path))
     try:
-        arrays = loadmat(BytesIO(content))
+        arrays = loadmat(content)
     except Exception as error:  # SciPy raises many kinds for a damaged file
         raise InputError(str(path), f"cannot be read ({error})", "a MATLAB file", "copy it again") from None
     known = ("TXZY_dataI", "TXZY_data")  # cut into contacts, and whole
@@ -338,17 +335,16 @@ def _contacts(path: Path, content: bytes) -> list[TaxelContact]:
         expected = f"a cell array objects x {1 + _FINGERS} x trials (x contacts)"
         raise InputError(str(path), found, expected)
     cells = cells.reshape(*cells.shape[:3], -1)
-    numbers = np.ndindex(cells.shape[0], *cells.shape[2:])
-    return [
-        TaxelContact(o + 1, t + 1, c + 1, _pressure(f"{path}, {name}", cells[o, 1:, t, c], (o, t, c)))
-        for o, t, c in numbers
-    ]
+    contacts = []
+    for thing, trial, contact in np.ndindex(cells.shape[0], *cells.shape[2:]):
+        number = thing + 1, trial + 1, contact + 1
+        where = "{}, {}, object {}, trial {}, contact {}".format(path, name, *number)
+        contacts.append(TaxelContact(*number, _pressure(where, cells[thing, 1:, trial, contact])))
+    return contacts
 
 
-def _pressure(where: str, fingers: np.ndarray, number: tuple[int, int, int]) -> np.ndarray:
+def _pressure(where: str, fingers: np.ndarray) -> np.ndarray:
     """[T, 3, 22] of the cells of three fingertips."""
-    thing, trial, contact = (k + 1 for k in number)
-    where = f"{where}, object {thing}, trial {trial}, contact {contact}"
     shapes = {finger.shape for finger in fingers}
     samples, *columns = fingers[0].shape
     if len(shapes) > 1 or columns != [_TAXELS] or not samples:
@@ -366,14 +362,13 @@ def open_contacts(config: TaxelConfig) -> InMemorySource:
     Raises:
         InputError: see `read_contacts`; there is no such object.
     """
-    content = read_bytes(config.file)
-    contacts = _contacts(config.file, content)
+    contacts = read_contacts(config.file)
     chosen = [contact.pressure for contact in contacts if contact.object == config.object]
     if not chosen:
         last = max(contact.object for contact in contacts)
         raise InputError("source.settings.object", str(config.object), f"1 to {last}")
     views = np.concatenate(chosen)[..., None]
-    digest = digest_of([content, str(config.object).encode()])
+    digest = digest_of([config.file, str(config.object).encode()])
     time, alive = np.arange(len(views), dtype=float), np.ones(_FINGERS * _TAXELS, bool)
     return _source(f"{config.file.stem}, object {config.object}", digest, time, views, alive=alive)
 
