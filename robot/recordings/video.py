@@ -210,13 +210,16 @@ def camera_rows(
             raise InputError(place, found, f"{size[1]} x {size[0]}, as in frame 0")
         pictures.append(image_view(views, grey, place))
         if odometry is not None:
-            turns, ways = (_profile(odometry, name, grey, place) for name in ("rotation", "translation"))
+            after = (
+                _profile(odometry, "rotation", grey, place),
+                _profile(odometry, "translation", grey, place),
+            )
             pixel_angle = float(np.deg2rad(odometry.fov_deg)) / size[1]
             step = 0.0, 0.0
             if before is not None:
-                step = _motion_between(odometry, before, (turns, ways), pixel_angle, moment - time[-1])
+                step = _motion_between(odometry, before, after, pixel_angle, moment - time[-1])
             moves.append(step)
-            before = turns, ways
+            before = after
         time.append(moment)
     if not time:
         raise InputError(where, "no frames", "at least one image")

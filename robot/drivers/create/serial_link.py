@@ -172,8 +172,10 @@ class SerialLink:
     def _rest(self) -> bytes:
         """All bytes until the line is quiet, at most those of one time-out."""
         self._port.timeout = QUIET
-        data, most = b"", protocol.BAUD // 10 * ANSWER
-        while len(data) < most and (more := self._port.read(max(1, self._port.in_waiting))):
+        data = b""
+        while len(data) < protocol.BAUD // 10 * ANSWER and (
+            more := self._port.read(max(1, self._port.in_waiting))
+        ):
             data += more
         return data
 
