@@ -32,7 +32,7 @@ from robot.live.arm_route import (
 from robot.live.live_rig import Rig
 from robot.live.polling import SessionFault, session_fault
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
-from robot.sources.source import SourceInfo
+from robot.sources.source import SourceDescription, SourceInfo
 from robot.world.maze import POSE_CELL_SIZE
 from robot.world.scene import HeadPath, maze_info
 from tactile.calibration import Calibration, calibrate
@@ -170,21 +170,16 @@ class ArmSession(LiveRobot):
         rows = ceil(1.5 * whole.duration * rate) if live.whisks is None else live.whisks
         maze = None if live.waypoints else maze_info(plan_scene(plan, head).maze, plan.maze, plan.seed)
         provenance = {"live": live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})}
-        self.job = MappingJob(
-            mapped_config(config, directory, rows),
-            SourceInfo(
-                raw_whiskers=True,
-                cell_size=POSE_CELL_SIZE,
-                head=config.touch.head,
-                maze=maze,
-                provenance=provenance,
-            ),
-            directory,
-            view_shape(config.touch.image, head),
-            len(head.length),
-            rate,
-            float(np.abs(whole.pose[:, :2] - whole.pose[0, :2]).max()),
+        info = SourceInfo(
+            raw_whiskers=True,
+            cell_size=POSE_CELL_SIZE,
+            head=config.touch.head,
+            maze=maze,
+            provenance=provenance,
         )
+        source = SourceDescription(view_shape(config.touch.image, head), len(head.length), rate, info)
+        extent = float(np.abs(whole.pose[:, :2] - whole.pose[0, :2]).max())
+        self.job = MappingJob(mapped_config(config, directory, rows), source, directory, extent)
         self.total = live.whisks or (None if goals else ceil(path.duration * rate))
         self._goals = goals
         self._steering: GoalSteering | None = None

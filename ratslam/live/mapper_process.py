@@ -24,7 +24,7 @@ import numpy as np
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.processes import step_back, withheld_signals
-from robot.sources.source import ClosedSource, Sample, SourceInfo
+from robot.sources.source import ClosedSource, Sample, SourceDescription
 from tactile.base.errors import InputError
 from tactile.calibration import Calibration
 from tactile.whisker_geometry import ur10_head
@@ -39,19 +39,15 @@ class MappingJob(NamedTuple):
     """Input of the mapper before the first sample.
 
     Attributes:
-        config: its `recording` is the file that the session is recorded to. info: as in that file, without
-            the calibration, which follows.
-        directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
+        config: its `recording` is the file that the session is recorded to.
+        source: as in that file, without the calibration, which follows. directory: the new run directory.
         extent_m: largest distance from the start along x or y on the planned path, m.
         view: target of a live view, or None.
     """
 
     config: RunConfig
-    info: SourceInfo
+    source: SourceDescription
     directory: Path
-    view_shape: tuple[int, int, int]
-    whiskers: int
-    rate_hz: float
     extent_m: float
     view: str | None = None
 
@@ -205,9 +201,9 @@ class PipeSource(ClosedSource):
 
     name, digest, length = "live", "", None
 
-    def __init__(self, job: MappingJob, line: Connection) -> None:
-        self.rate_hz, self.view_shape, self.whiskers = job.rate_hz, job.view_shape, job.whiskers
-        self.info = job.info
+    def __init__(self, like: SourceDescription, line: Connection) -> None:
+        self.rate_hz, self.view_shape, self.whiskers = like.rate_hz, like.view_shape, like.whiskers
+        self.info = like.info
         self.interrupted = True  # until the parent sends the flag
         self.received, self.count = 0.0, 0
         self._line = line
@@ -249,7 +245,7 @@ def _map(line: Connection) -> None:
     from tactile.base.types import Odometry, observation
 
     job = line.recv()
-    with PipeSource(job, line) as fed, open_viewer(job.view) as observers:
+    with PipeSource(job.source, line) as fed, open_viewer(job.view) as observers:
         config = complete(job.config, fed, job.extent_m)
         source = open_touch_source(fed, config.touch)  # for its shapes: no sample is read without calibration
         check_finished_map(config, source)

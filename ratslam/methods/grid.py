@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from ratslam.core.backend import Backend
-from ratslam.core.estimates import Action, Estimate, Scalar
+from ratslam.core.estimates import Estimate, Scalar
 from ratslam.grid import likelihoods, particles
 from ratslam.grid.config import GridConfig
 from ratslam.grid.contact_features import ContactFeatures, contact_features
@@ -150,8 +150,7 @@ class GridBackend(Backend):
         outcome = jnp.where(outside, GridOutcome.OUTSIDE, outcome)
         outcome = jnp.where(vanished, GridOutcome.VANISHED, outcome)
         outcome = jnp.where(clean, outcome, GridOutcome.NOT_FINITE).astype(jnp.int32)
-        place = jnp.int32(-1)  # a grid has no places
-        estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), vanished)
+        estimate = Estimate.without_place(pose, spread, vanished)
         evidence = GridEvidence(drawn.ancestor, poses, share, worth, outcome)
         touched = jnp.where(features.valid, features.touching, False)
         after = GridState(swarm, maps, wall_directions, motion, touched, jax.random.key_data(key))

@@ -21,7 +21,7 @@ from jax import lax
 
 from ratslam.classic import view_templates
 from ratslam.core.backend import Backend, Map, PoseCellProbe, enlarge
-from ratslam.core.estimates import Action, Estimate, PoseCellActivity, Scalar
+from ratslam.core.estimates import Estimate, PoseCellActivity, Scalar
 from ratslam.core.session import finite_values
 from ratslam.mapping.acceptance import Acceptance, AcceptByEvidence, AcceptByOdds
 from ratslam.mapping.appearance import (
@@ -267,15 +267,9 @@ class RecallBackend(Backend):
         outcome = jnp.where(has_room | ~seen, RecallOutcome.OK, RecallOutcome.FULL)
         outcome = jnp.where(clean, outcome, RecallOutcome.NOT_FINITE).astype(jnp.int32)
         sd, sd_heading = memory.pose_spread(self.recall, self.cell)
-        place = jnp.int32(-1)  # the map assigns places, because only it verifies closures
-        estimate = Estimate(
-            pose=memory.current_pose(),
-            spread=jnp.stack([sd, sd, sd_heading]),
-            place=place,
-            previous=place,
-            action=jnp.int32(Action.NONE),
-            lost=health < self.config.min_fit_share,
-        )
+        # The map assigns places, because only it verifies closures.
+        spread, lost = jnp.stack([sd, sd, sd_heading]), health < self.config.min_fit_share
+        estimate = Estimate.without_place(memory.current_pose(), spread, lost)
         evidence = RecallEvidence(
             **result._asdict(), certainty=jnp.sum(state.belief.activity), packet=packet, health=health,
             outcome=outcome,

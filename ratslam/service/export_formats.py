@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
@@ -188,7 +189,7 @@ def export_run(
         case ".g2o" | ".json":
             what = "a pose graph" if suffix == ".g2o" else "a map of experiences"
             file = _file(directory / f"map{suffix}", what)
-            make_new_file(output, lambda path: shutil.copyfile(file, path))
+            make_new_file(output, partial(shutil.copyfile, file))
         case ".graphml":
             import networkx  # slow to import
 

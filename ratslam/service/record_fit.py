@@ -203,14 +203,13 @@ def _from_revisits(config: RunConfig, samples: list[Sample], assumed: OdometryCo
     if config.recording is None:
         return Rig(unknown=("wheels: the record has no true poses",))
     scale = "length scale: no true poses, and a map closes its loops at any scale"
-    if not any(shows_place(sample.reading) for sample in samples):
-        reason = "no true poses, and no views that tell revisits"
-        return Rig(unknown=(scale, f"turn scale, heading bias: {reason}"))
-    found = fit_revisits(config, assumed)
-    if found is None:
-        reason = "no true poses, and the map closes no loops or is doubted"
-        return Rig(unknown=(scale, f"turn scale, heading bias: {reason}"))
-    return found._replace(unknown=(scale,))
+    reason = "no views that tell revisits"
+    if any(shows_place(sample.reading) for sample in samples):
+        found = fit_revisits(config, assumed)
+        if found is not None:
+            return found._replace(unknown=(scale,))
+        reason = "the map closes no loops or is doubted"
+    return Rig(unknown=(scale, f"turn scale, heading bias: no true poses, and {reason}"))
 
 
 def shows_place(reading: Any) -> bool:
