@@ -148,12 +148,10 @@ def _undo(arguments: argparse.Namespace) -> int:
         output = arguments.map = replaced_file(arguments.map)
         finished = finish_change(output.parent)
         if finished is not None:
-            folder = output.parent
-            print(f"{folder}: the undo of sequence {finished}, which had been cut off, is complete")
+            print(f"{output.parent}: the undo of sequence {finished}, which had been cut off, is complete")
         if finished == str(arguments.sequence):
             return 0
-    saved = _read(arguments.map)
-    rewritten = undo_sequence(saved, arguments.sequence, output)
+    rewritten = undo_sequence(_read(arguments.map), arguments.sequence, output)
     print(f"{output}: the map without sequence {arguments.sequence}")
     if rewritten:
         print(f"{output.parent}: trajectory, graph, closures and map.png follow it")
@@ -308,8 +306,7 @@ def _path(arguments: argparse.Namespace) -> int:
         f"{len(places)} experiences from {places[0]} to {places[-1]}: {way.length:.2f} m, {way.seconds:.0f} s"
     ]
     if not isinstance(goal, int):
-        apart = math.dist(way.poses[-1][:2], goal)
-        lines.append(f"ends {apart:.2f} m from {goal[0]:g},{goal[1]:g}")
+        lines.append(f"ends {math.dist(way.poses[-1][:2], goal):.2f} m from {goal[0]:g},{goal[1]:g}")
     elif places[-1] != goal:
         lines.append(f"ends at {places[-1]}, which is so near to {goal} that it counts as the same place")
     lines.append(

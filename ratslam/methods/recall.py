@@ -229,8 +229,7 @@ class RecallBackend(Backend):
         return memory, self._anchored(memory, belief)
 
     def _anchored(self, memory: Memory, belief: Belief) -> Belief:
-        cells = filter.view_cells(self.recall, memory)
-        return pose_cells.anchor(self.network, belief, cells, belief.mass)
+        return pose_cells.anchor(self.network, belief, filter.view_cells(self.recall, memory), belief.mass)
 
     def kernel(
         self, state: RecallState, observation: Observation

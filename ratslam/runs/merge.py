@@ -133,10 +133,7 @@ def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: Map
     made, first = session.map, maps[0]
     source = replace(first.source, name=" + ".join(dict.fromkeys(saved.source.name for saved in maps)))
     estimate = START._replace(pose=made.trajectory()[-1])
-
-    def write(file: Path) -> None:
-        write_map(file, session, first.config, source, estimate=estimate)
-
+    write = partial(write_map, session=session, config=first.config, source=source, estimate=estimate)
     if output.suffix == ".npz":
         make_new_file(output, write)
         return

@@ -276,8 +276,7 @@ def _fit_head(config: RunConfig, samples: list[Sample], info: SourceInfo) -> Rig
         f"head: {contacts} contacts; their protractions err by {1e3 * errors[0]:.1f} mrad, "
         f"{1e3 * errors[1]:.1f} with the head assumed; the radii are set in touch.head.rings"
     )
-    settings = {"touch": {"head": {"rings": rings}}}
-    return Rig(tuple(quantities), settings, (note, DELAY), tuple(unknown))
+    return Rig(tuple(quantities), {"touch": {"head": {"rings": rings}}}, (note, DELAY), tuple(unknown))
 
 
 FOLDS, BLOCK = 3, 10

@@ -119,8 +119,7 @@ class Drawing:
         observation = step.observation
         if observation.view_seen and observation.view.size:
             pixels = np.rint(255 * np.clip(observation.view, 0.0, 1.0)).astype(np.uint8)
-            shown = pixels if pixels.shape[2] == 3 else pixels[..., 0]
-            self._log("view", self._rr.Image(shown))
+            self._log("view", self._rr.Image(pixels if pixels.shape[2] == 3 else pixels[..., 0]))
         if self._run.head is not None:
             self._draw_whiskers(observation)
 
@@ -175,8 +174,7 @@ class Drawing:
             if before != sign:
                 self._verdicts[earlier, later] = sign
                 verdict = "dropped" if before == 1 else VERDICTS[sign][0]
-                text = f"step {later} with step {earlier}: {verdict}"
-                self._log("judgements", self._rr.TextLog(text))
+                self._log("judgements", self._rr.TextLog(f"step {later} with step {earlier}: {verdict}"))
         known = closures[(closures[:, :2] < len(self._path.rows)).all(axis=1)]
         for sign, (name, colour) in VERDICTS.items():
             self._draw_pairs(f"closures/{name}", known[known[:, 2] == sign, :2], colour)
