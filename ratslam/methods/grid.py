@@ -21,6 +21,7 @@ from ratslam.grid.config import GridConfig
 from ratslam.grid.contact_features import ContactFeatures, contact_features
 from ratslam.grid.map import GridMap
 from ratslam.grid.particles import COSINE, EVIDENCE, LAYERS, SINE, Particles
+from ratslam.methods.config import GridBackendConfig
 from tactile.base.errors import InputError
 from tactile.base.types import Array, MotionKind, Observation
 from tactile.whisker_geometry import PlanarWhiskers
@@ -305,7 +306,7 @@ class GridBackend(Backend):
         return particles.to_cells(particles.placed(pose, points), self.config.cell, self.side)
 
 
-def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.float64) -> GridBackend:
+def build(settings: GridBackendConfig, feelers: PlanarWhiskers | None, dtype: Any) -> GridBackend:
     """The backend for a session with these whiskers.
 
     Raises:
@@ -315,6 +316,7 @@ def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.fl
         raise InputError(
             "backend", "grid, for a recording without whiskers", "recall, or a recording with whiskers"
         )
+    config = settings.grid
     side = config.side or LIVE_SIDE
     if config.particles * LAYERS * np.ceil(side / config.cell) ** 2 > MAX_CELLS:
         found = f"{config.particles} particles with maps of {side:g} m in cells of {config.cell:g} m"

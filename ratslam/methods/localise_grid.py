@@ -157,7 +157,7 @@ def build(
     Raises:
         InputError: the map cannot be read, or was not made with these settings and whiskers.
     """
-    settings, method = config.localise, grid.build(config.grid, feelers, dtype)
+    settings, method = config.localise, grid.build(config, feelers, dtype)
     made = restore_map(settings, method.new_map(), "grid")
     here = settings.start == "here"
     return GridLocaliseBackend(made, settings.log_odds or LOG_ODDS, settings.particles, dtype, here)
