@@ -164,11 +164,7 @@ def find_map_way(
         raise InputError(str(saved.path), found, "a map of `backend: recall` or `backend: classic`")
     last = experience_at(graph, goal, FARTHEST, "--to")
     if start is None:
-        first = (
-            nearest_experience(graph, made.trajectory()[-1], FARTHEST, HEADING_RADIUS)
-            if saved.steps
-            else None
-        )
+        first = nearest_experience(graph, made.trajectory()[-1], FARTHEST, HEADING_RADIUS)
         if first is None:
             found = f"the map's last pose has no experience within {FARTHEST:g} m"
             raise InputError("--from", found, "a robot on driven ground", "give X,Y or an experience")

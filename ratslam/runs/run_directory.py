@@ -176,18 +176,14 @@ class RunDirectory:
         """Writes changes.csv of a session that was localised in a map."""
         if not isinstance(map, Localiser):
             return
-        steps = map.visits().step
+        steps, same = map.visits().step, ("extent", "kind", "evidence", "alarms", "passes")
         rows = [
             ChangeRow(
                 x=float(change.position[0]),
                 y=float(change.position[1]),
-                extent=change.extent,
-                kind=change.kind,
-                evidence=change.evidence,
-                alarms=change.alarms,
-                passes=change.passes,
                 first_step=int(steps[change.keyframes[0]]),
                 last_step=int(steps[change.keyframes[-1]]),
+                **{name: getattr(change, name) for name in same},
             )
             for change in changes_of(map, config)
         ]

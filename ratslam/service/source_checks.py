@@ -27,13 +27,7 @@ from ratslam.service.check_results import (
 )
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.source import SOURCES, ClosedSource, Sample, Source, SourceEntry, SourceInfo, rate_of
-from robot.touch_source import (
-    TOUCH,
-    ReadingProcessor,
-    TouchEntry,
-    open_touch_source,
-    touch_config_of,
-)
+from robot.touch_source import TOUCH, ReadingProcessor, TouchEntry, open_touch_source, touch_config_of
 from tactile.base.errors import InputError
 from tactile.base.plugins import NoSettings, PluginConfig
 from tactile.base.se2 import compose

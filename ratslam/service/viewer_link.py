@@ -210,8 +210,7 @@ def _start_viewer() -> None:
 
 
 def _answers(host: str, port: int) -> bool:
-    try:
+    with suppress(OSError):
         socket.create_connection((host.strip("[]"), port), timeout=1.0).close()
-    except OSError:
-        return False
-    return True
+        return True
+    return False

@@ -19,6 +19,7 @@ from ratslam.core.arrays import GrowableArray
 from ratslam.core.estimates import GridDrawing, PoseCellActivity
 from ratslam.runs.runner import MapReport, RunDescription, StepReport
 from ratslam.service.viewer_link import GONE
+from tactile.base.errors import tell
 from tactile.whisker_geometry import Head
 
 APPLICATION = "ratslam"
@@ -293,11 +294,7 @@ def main(target: str, source: BinaryIO) -> int:
         if target.endswith(".rrd"):
             recording.disconnect()  # completes the file; with a viewer this may wait for ever
     except (RuntimeError, TimeoutError) as error:
-        print(
-            f"ratslam: warning: the view at {target} is gone ({error}); the run goes on without it",
-            file=sys.stderr,
-            flush=True,
-        )
+        tell(f"warning: the view at {target} is gone ({error}); the run goes on without it")
         return GONE
     return 0
 
