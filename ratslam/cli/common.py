@@ -85,7 +85,7 @@ class Commands:
     def add(
         self,
         name: str,
-        run: Callable[[argparse.Namespace], int] | None,
+        run: Callable[[argparse.Namespace], int | None] | None,
         help: str,
         example: str,
         group: str = "",
@@ -93,8 +93,8 @@ class Commands:
         """Registers a command.
 
         Args:
-            run: takes the parsed arguments, returns the exit code; None for a command with commands of its
-                own (`Commands(parser)` adds them).
+            run: takes the parsed arguments, returns the exit code or nothing for 0; None for a command with
+                commands of its own (`Commands(parser)` adds them).
             help: one line, at most 60 characters.
             example: the arguments of a call that works, without `ratslam`.
             group: heading under which the program's help lists it.

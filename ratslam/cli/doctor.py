@@ -94,7 +94,7 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     return diagnosis._replace(advice=(*diagnosis.advice, f"python -m ratslam run {output}"))
 
 
-def _fit(arguments: argparse.Namespace) -> int:
+def _fit(arguments: argparse.Namespace) -> None:
     if arguments.seed < 0:
         raise InputError("--seed", str(arguments.seed), "a non-negative integer")
     prepare_jax()
@@ -109,7 +109,6 @@ def _fit(arguments: argparse.Namespace) -> int:
         text = rig.file_text(str(arguments.record))
         make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
         print(f"{output}: written")
-    return 0
 
 
 def _config_of(arguments: argparse.Namespace) -> RunConfig:

@@ -69,14 +69,14 @@ def _read(path: Path) -> SavedMap:
     return read_map(path, tell)
 
 
-def _info(arguments: argparse.Namespace) -> int:
+def _info(arguments: argparse.Namespace) -> None:
     saved = _read(arguments.map)
     from ratslam.runs.map_care import map_info
 
     info = map_info(saved)
     if arguments.json:
         print(json.dumps(info, indent=2))
-        return 0
+        return
     box = "{:.2f}, {:.2f} to {:.2f}, {:.2f} m".format(*info["box_m"]) if info["box_m"] else "empty"
     lines = [
         f"map         {info['path']}, {info['format']}, sha256 {info['digest'][:12]}",
@@ -106,20 +106,19 @@ def _info(arguments: argparse.Namespace) -> int:
     elif info["unjudged"]:
         lines.append(f"doubt       none: {info['unjudged']}")
     print("\n".join(lines))
-    return 0
 
 
-def _diff(arguments: argparse.Namespace) -> int:
+def _diff(arguments: argparse.Namespace) -> None:
     first, second = _read(arguments.map), _read(arguments.other)
     from ratslam.runs.map_care import map_difference
 
     found = map_difference(first, second)
     if arguments.json:
         print(json.dumps(found, indent=2))
-        return 0
+        return
     if found["same"]:
         print("the same map")
-        return 0
+        return
     lines = [
         "steps     {} and {}".format(*found["steps"]),
         "places    {common} in both, {removed} only in the first, {added} only in the second".format(**found),
@@ -135,10 +134,9 @@ def _diff(arguments: argparse.Namespace) -> int:
     lines.append(f"sensor    {found['sensor'] or 'the same'}")
     lines += [f"setting   {key}: {one!r} and {other!r}" for key, (one, other) in found["settings"].items()]
     print("\n".join(lines))
-    return 0
 
 
-def _undo(arguments: argparse.Namespace) -> int:
+def _undo(arguments: argparse.Namespace) -> None:
     output: Path | None = arguments.output
     prepare_jax()
     from ratslam.runs.folder_change import finish_change
@@ -150,15 +148,14 @@ def _undo(arguments: argparse.Namespace) -> int:
         if finished is not None:
             print(f"{output.parent}: the undo of sequence {finished}, which had been cut off, is complete")
         if finished == str(arguments.sequence):
-            return 0
+            return
     rewritten = undo_sequence(_read(arguments.map), arguments.sequence, output)
     print(f"{output}: the map without sequence {arguments.sequence}")
     if rewritten:
         print(f"{output.parent}: trajectory, graph, closures and map.png follow it")
-    return 0
 
 
-def _crop(arguments: argparse.Namespace) -> int:
+def _crop(arguments: argparse.Namespace) -> None:
     prepare_jax()
     from ratslam.places.crop import keyframes_in_box, keyframes_of_piece, keyframes_of_steps
     from ratslam.runs.map_care import Choose, crop_saved
@@ -181,7 +178,6 @@ def _crop(arguments: argparse.Namespace) -> int:
     saved = _read(arguments.map)
     count = crop_saved(saved, choose, arguments.output)
     print(f"{arguments.output}: {count} of {saved.steps} steps")
-    return 0
 
 
 CONFIGURATIONS = (".yaml", ".yml", "")
@@ -209,11 +205,10 @@ def _localise(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.report.verdict import summarise
     from ratslam.runs.localise import check_assignments, localise, recorded_alike
-    from ratslam.runs.saved_map import read_map
     from ratslam.runs.settings.run_config import load_config
     from ratslam.service.viewer_link import open_viewer
 
-    target, saved = open_target(arguments), read_map(arguments.map, tell)
+    target, saved = open_target(arguments), _read(arguments.map)
     file: Path = arguments.recording
     if file.suffix in CONFIGURATIONS and not file.is_dir():
         config = load_config(file, arguments.set)
@@ -243,13 +238,12 @@ def add_merge(commands: Commands) -> None:
     merge.add_argument("--json", action="store_true", help="print JSON")
 
 
-def _merge(arguments: argparse.Namespace) -> int:
+def _merge(arguments: argparse.Namespace) -> None:
     prepare_jax()
     from ratslam.runs.merge import describe_merge, merge_maps
 
     report = merge_maps(arguments.maps, arguments.output, tell)
     print(json.dumps(report, indent=2) if arguments.json else describe_merge(report))
-    return 0
 
 
 Place = tuple[float, float] | int
@@ -287,9 +281,8 @@ def _path(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from ratslam.live.goal_planner import draw_map_way, find_map_way
     from ratslam.places.route import NoWay
-    from ratslam.runs.saved_map import read_map
 
-    saved = read_map(arguments.map, tell)
+    saved = _read(arguments.map)
     made = saved.open_session().map
     try:
         way = find_map_way(made, saved, start, goal, arguments.mode)

@@ -65,7 +65,7 @@ def add_look(commands: Commands) -> None:
     )  # fmt: skip
 
 
-def _watch(arguments: argparse.Namespace) -> int:
+def _watch(arguments: argparse.Namespace) -> None:
     from evaluation.artifacts.manifest import RUNNING
     from evaluation.monitor import KILLED, WATCH_IMAGE, watch_run
 
@@ -83,10 +83,9 @@ def _watch(arguments: argparse.Namespace) -> int:
     if seen.status == KILLED or (silent and not arguments.once):
         print(f"{silent}the run was killed; `run --continue {arguments.directory}` continues")
     print(f"{arguments.directory / WATCH_IMAGE} shows its map")
-    return 0
 
 
-def _score(arguments: argparse.Namespace) -> int:
+def _score(arguments: argparse.Namespace) -> None:
     from evaluation.artifacts.run_reader import read_run
     from evaluation.metrics.energy_metric import read_relations
     from evaluation.metrics.exm import ExmConfig, read_experience_log
@@ -106,7 +105,6 @@ def _score(arguments: argparse.Namespace) -> int:
     else:
         card = score_log(read_experience_log(arguments.log), arguments.log.stem, exm=exm)
     print(card.model_dump_json(indent=2) if arguments.json else _render_scores(arguments.log, card))
-    return 0
 
 
 def _render_scores(path: Path, card: Scorecard) -> str:
@@ -122,12 +120,11 @@ def _render_scores(path: Path, card: Scorecard) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def _report(arguments: argparse.Namespace) -> int:
+def _report(arguments: argparse.Namespace) -> None:
     from ratslam.runs.map_results import write_report
 
     write_report(arguments.runs, arguments.output)
     print(f"{arguments.output}: open it in a browser; it needs no network")
-    return 0
 
 
 class _StatusLine:

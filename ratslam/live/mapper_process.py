@@ -13,11 +13,11 @@ import queue
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -71,7 +71,7 @@ class MappedSample(NamedTuple):
     points: np.ndarray
 
 
-class Mapper:
+class Mapper(AbstractContextManager["Mapper"]):
     """Handle of the mapper process; a context manager. The process starts at once, to be ready early.
 
     Args:
@@ -180,9 +180,6 @@ class Mapper:
             if isinstance(message, bool):
                 return
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self._process.join(0.0 if self._card is None else 5.0)
         self._process.kill()  # at the end of this process SIGTERM would be sent, which it does not get
@@ -241,8 +238,9 @@ def _map(line: Connection) -> None:
     from ratslam.runs.runner import check_finished_map, open_runner
     from ratslam.runs.settings.completion import complete
     from ratslam.service.viewer_link import open_viewer
+    from robot.sources.in_memory import NO_ODOMETRY
     from robot.touch_source import open_touch_source
-    from tactile.base.types import Odometry, observation
+    from tactile.base.types import observation
 
     job = line.recv()
     with PipeSource(job.source, line) as fed, open_viewer(job.view) as observers:
@@ -250,9 +248,7 @@ def _map(line: Connection) -> None:
         source = open_touch_source(fed, config.touch)  # for its shapes: no sample is read without calibration
         check_finished_map(config, source)
         session = build_session(config, source)
-        still = Odometry(0.0, 0.0, 0.0, 0.0)
-        blank = observation(still, view_shape=source.view_shape, whiskers=source.whiskers)
-        session.warm(blank)
+        session.warm(observation(NO_ODOMETRY, view_shape=source.view_shape, whiskers=source.whiskers))
         gc.collect()
         gc.freeze()  # what compiling has left need not be searched again: a full collection takes 0.1 s
         line.send(True)

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import fcntl
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -56,7 +56,7 @@ WhiskerView = tuple[np.ndarray, np.ndarray]
 """A whisker image: brightness [R, C, K] in 0..1, and bool [W], the whisker has a signal."""
 
 
-class RunDirectory:
+class RunDirectory(AbstractContextManager["RunDirectory"]):
     """A new run directory; a context manager that closes its text files.
 
     Its process holds a lock on steps.csv, which distinguishes a run from one that was killed.
@@ -82,9 +82,6 @@ class RunDirectory:
         heads = {"steps.csv": ",".join((*COLUMNS, *columns)), "online_error.csv": "t,error"}
         heads["timing.csv"] = "step,steps,seconds"
         self.append({name: head + "\n" for name, head in heads.items()})
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         for file in self._streams.values():
