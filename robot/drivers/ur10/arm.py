@@ -151,7 +151,7 @@ SAFETY_STOPS = {SessionOutcome.PROTECTIVE_STOP, SessionOutcome.SAFEGUARD_STOP, S
 """Outcomes after which a controller may resume its program: the program is ended."""
 
 
-class Arm:
+class Arm(contextlib.AbstractContextManager["Arm"]):
     """One arm. One thread calls its methods; a supervising thread updates its state.
 
     Attributes:
@@ -177,9 +177,6 @@ class Arm:
         self._late = 0.0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="arm", daemon=True)
-
-    def __enter__(self) -> Arm:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
