@@ -40,17 +40,10 @@ from ratslam.network import pose_cells
 from ratslam.network.config import Network
 from ratslam.network.pose_cells import Belief
 from ratslam.places.map_views import MapViews, PieceTies
-from ratslam.recall import filter
+from ratslam.recall import filter, observation_model
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.filter import RecallResult
 from ratslam.recall.memory import CroppedRows, MapFeedback, Memory, MergedRows, init_memory
-from ratslam.recall.observation_model import (
-    ObservationLikelihood,
-    label_likelihood,
-    signed_likelihood,
-    touch_likelihood,
-    view_likelihood,
-)
 from ratslam.recall.signed_likelihood import stored_image
 from ratslam.recall.whisker_likelihood import live_pixels, pixel_layout, pixel_levels
 from tactile.base.se2 import compose, correct_heading
@@ -397,13 +390,13 @@ class RecallBackend(Backend):
 
     def likelihood(
         self, config: RecallConfig, memory: Memory, view: Array, label: Array
-    ) -> tuple[Memory, ObservationLikelihood]:
+    ) -> tuple[Memory, observation_model.ObservationLikelihood]:
         """Likelihood of a view's features, or of an id, at every keyframe of a memory; and the memory with
         what the next view needs."""
         if self.labels:
-            return memory, label_likelihood(config, memory, label)
+            return memory, observation_model.label_likelihood(config, memory, label)
         if self.signed:
-            return signed_likelihood(config, memory, view)
+            return observation_model.signed_likelihood(config, memory, view)
         if self.pixels is not None:
-            return touch_likelihood(config, memory, view, self.pixels)
-        return memory, view_likelihood(config, self.cell, memory, view)
+            return observation_model.touch_likelihood(config, memory, view, self.pixels)
+        return memory, observation_model.view_likelihood(config, self.cell, memory, view)

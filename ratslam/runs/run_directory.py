@@ -18,12 +18,6 @@ import numpy as np
 from evaluation.artifacts import recorded_views
 from evaluation.artifacts.closure_table import CHANGES, ChangeRow, read_closure_table, write_changes
 from evaluation.artifacts.grid_files import read_grid, write_grid_truth, write_nav2
-from evaluation.artifacts.recorded_views import (
-    ClosureViews,
-    WhiskerViews,
-    write_closure_views,
-    write_whisker_views,
-)
 from evaluation.artifacts.run_reader import write_walls
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
 from evaluation.metrics.occupancy_score import score_grid
@@ -135,14 +129,14 @@ class RunDirectory(AbstractContextManager["RunDirectory"]):
         if not views or views[0][0].shape[:2] != head.shape or len(views[0][1]) != len(head.length):
             return
         columns = head.shape[1]
-        images = WhiskerViews(
+        images = recorded_views.WhiskerViews(
             view=np.array([view[..., 0] for view, _ in views]),
             alive=np.array([alive.reshape(head.shape) for _, alive in views]),
             azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
             length=head.length[::columns],
             tallest=config.image.tallest,
         )
-        self.file("views.npz", lambda path: write_whisker_views(path, images))
+        self.file("views.npz", lambda path: recorded_views.write_whisker_views(path, images))
 
     def save_closure_views(self, images: Sequence[np.ndarray | None]) -> None:
         """Writes recorded_views.npz: the images [R, C] of the steps that closures join; None: no view."""
@@ -150,8 +144,8 @@ class RunDirectory(AbstractContextManager["RunDirectory"]):
         seen = {step: image for step, image in enumerate(images) if image is not None}
         steps = [step for step in joined if step in seen]
         if steps:
-            views = ClosureViews(np.array(steps), np.stack([seen[step] for step in steps]))
-            self.file(recorded_views.NAME, lambda path: write_closure_views(path, views))
+            views = recorded_views.ClosureViews(np.array(steps), np.stack([seen[step] for step in steps]))
+            self.file(recorded_views.NAME, lambda path: recorded_views.write_closure_views(path, views))
 
     def save_grid_map(self) -> None:
         """Writes map.pgm and map.yaml if the map is a grid; if the arena and the robot's start in it are
