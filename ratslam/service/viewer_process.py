@@ -55,7 +55,7 @@ class Drawing:
     def __init__(self, recording: Any) -> None:
         import rerun
 
-        self._rr, self._recording = rerun, recording
+        self._rr, self._recording, self._log = rerun, recording, recording.log
         self._run = RunDescription("", "")
         self._start: float | None = None
         self._path = GrowableArray((3,), np.float64)  # of all steps: as last reported, then online
@@ -90,9 +90,6 @@ class Drawing:
         """Draws the final map."""
         if len(self._online.rows):
             self._draw_map(map)
-
-    def _log(self, name: str, part: Any, static: bool = False) -> None:
-        self._recording.log(name, part, static=static)
 
     def _log_lines(self, name: str, strips: list[Any], colour: tuple[int, int, int], width: float) -> None:
         radius = self._rr.Radius.ui_points(width)

@@ -203,10 +203,8 @@ def _check_plugins(document: Document, config: RunConfig) -> None:
             elif document.value(settings):
                 found = f"settings of a registered {registry.noun}, but '{plugin}' is one of ours"
                 raise InputError(document.at_key(settings), found)
-        except InputErrors as several:
-            errors += several.errors
         except InputError as error:
-            errors.append(error)
+            errors += getattr(error, "errors", [error])  # of several together, or itself
     if errors:
         raise InputErrors(errors)
 
