@@ -151,20 +151,15 @@ class Sensor(NamedTuple):
             geometry = {f"touch.reports.{name}": reports[name] for name in ("mounts", "length")}
             kind, made = FIXED_WHISKERS, {"touch.reports.walls": reports["walls"]}
         elif source.whiskers:
-            head = touch.head.model_dump(mode="json")
-            geometry = {
-                f"touch.head.{name}": head[name] for name in head if name not in ("dead", "limit_deg")
-            }
+            head = touch.head.model_dump(mode="json", exclude={"dead", "limit_deg"})
+            geometry = {f"touch.head.{name}": value for name, value in head.items()}
             kind, made = WHISKER_HEAD, flat_settings(touch.image.model_dump(mode="json"), "touch.image.")
         else:
             kind, made = VIEWS, _views_of(config)[1]
-        transform = made | {f"templates.{name}": value for name, value in templates.items()}
-        transform = {
-            name: value
-            for name, value in transform.items()
-            if value is not None or name.startswith("recording.")
-        }
-        plain = json.loads(json.dumps([geometry, transform]))  # lists for tuples, as a file gives them back
+        given = made | {f"templates.{name}": value for name, value in templates.items()}
+        kept = [name for name in given if given[name] is not None or name.startswith("recording.")]
+        # Lists for tuples, as a file gives them back.
+        plain = json.loads(json.dumps([geometry, {name: given[name] for name in kept}]))
         unit, cell = UNITS[info.signed_views], config.pose_cells.cell_size
         return cls(kind, source.view_shape, source.whiskers, unit, cell, *plain)
 
