@@ -65,6 +65,10 @@ class CommandParser(argparse.ArgumentParser):
         names = ("-o", "--output") if name == "-o" else (name,)
         self.add_argument(*names, type=Path, metavar=metavar, help=help, **options)
 
+    def add_flag(self, name: str, help: str) -> None:
+        """Adds an option without a value."""
+        self.add_argument(name, action="store_true", help=help)
+
 
 class Commands:
     """The commands of a parser: of the program, or of a command that has commands of its own.

@@ -32,9 +32,7 @@ def add_commands(commands: Commands) -> None:
         "with -o: a run directory or map of the same sensor, whose view, cells and method to take, so "
         "that the recording can be localised in it or continue it",
     )  # fmt: skip
-    doctor.add_argument(
-        "--live", action="store_true", help="check the robot of a live session; moves nothing"
-    )
+    doctor.add_flag("--live", "check the robot of a live session; moves nothing")
     add_set(doctor)
 
     fit = commands.add(

@@ -26,11 +26,11 @@ def add_map(commands: Commands) -> None:
     kinds = Commands(commands.add("map", None, help, "map info runs/square", "maps"))
     info = kinds.add("info", _info, "say what is in a map", "map info runs/square")
     _add_map(info)
-    _add_json(info)
+    info.add_flag("--json", "print JSON")
     diff = kinds.add("diff", _diff, "say what differs between two maps", "map diff runs/square runs/again")
     _add_map(diff)
     diff.add_path("other", "MAP", "the map to compare with it")
-    _add_json(diff)
+    diff.add_flag("--json", "print JSON")
     undo = kinds.add(
         "undo", _undo, "remove a closure sequence from a map", "map undo runs/square 0 -o runs/undone.npz"
     )
@@ -56,10 +56,6 @@ def add_map(commands: Commands) -> None:
 
 def _add_map(parser: CommandParser) -> None:
     parser.add_path("map", "MAP", "a run directory or a map file")
-
-
-def _add_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _read(path: Path) -> SavedMap:
@@ -235,7 +231,7 @@ def add_merge(commands: Commands) -> None:
     merge.add_path("maps", "MAP", "run directories or map files", nargs="+")
     help = "the new map: a file that ends in .npz, or a folder for it with its trajectory and graph"
     merge.add_path("-o", "MAP", help, required=True)
-    merge.add_argument("--json", action="store_true", help="print JSON")
+    merge.add_flag("--json", "print JSON")
 
 
 def _merge(arguments: argparse.Namespace) -> None:
@@ -272,7 +268,7 @@ def add_path(commands: Commands) -> None:
         help="least expected time (default), or RatSLAM's goal temporal map",
     )  # fmt: skip
     path.add_path("-o", "PNG", "draw the way to a new file", check=_require_new_picture)
-    path.add_argument("--json", action="store_true", help="print JSON")
+    path.add_flag("--json", "print JSON")
 
 
 def _path(arguments: argparse.Namespace) -> int:

@@ -313,14 +313,12 @@ def build(settings: GridBackendConfig, feelers: PlanarWhiskers | None, dtype: An
         InputError: there are no whiskers, or the maps have more cells than int32 can index.
     """
     if feelers is None:
-        raise InputError(
-            "backend", "grid, for a recording without whiskers", "recall, or a recording with whiskers"
-        )
+        found = "grid, for a recording without whiskers"
+        raise InputError("backend", found, "recall, or a recording with whiskers")
     config = settings.grid
     side = config.side or LIVE_SIDE
     if config.particles * LAYERS * np.ceil(side / config.cell) ** 2 > MAX_CELLS:
         found = f"{config.particles} particles with maps of {side:g} m in cells of {config.cell:g} m"
-        raise InputError(
-            "grid", found, "2^31 cells in all", "fewer particles, coarser cells or a smaller map"
-        )
+        cure = "fewer particles, coarser cells or a smaller map"
+        raise InputError("grid", found, "2^31 cells in all", cure)
     return GridBackend(config, feelers, side, dtype)

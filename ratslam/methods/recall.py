@@ -176,9 +176,8 @@ class RecallBackend(Backend):
     def merge_rows(self, state: RecallState, merged: MergedRows) -> RecallState:
         """The memory of the keyframes that remain; mass of merged ones goes to those they are merged with."""
         memory = state.memory.merge_rows(merged)
-        return state._replace(
-            memory=memory, belief=pose_cells.merge_rows(state.belief, merged.onto, merged.offset)
-        )
+        belief = pose_cells.merge_rows(state.belief, merged.onto, merged.offset)
+        return state._replace(memory=memory, belief=belief)
 
     def begin_piece(self, state: RecallState) -> RecallState:
         """All is novelty; the health is that of the start."""

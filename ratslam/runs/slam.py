@@ -201,8 +201,7 @@ def _describe_whiskers(info: SourceInfo, touch: TouchConfig) -> SourceDescriptio
         return SourceDescription((1, count, 1), count, info=info)
     if info.head is None:
         cure = "give the source itself, or a SourceDescription with the view shape"
-        raise InputError(
-            "info", "a SourceInfo without whiskers", "one with `head` or `planar_whiskers`", cure
-        )
+        expected = "one with `head` or `planar_whiskers`"
+        raise InputError("info", "a SourceInfo without whiskers", expected, cure)
     head = ur10_head(head_config_of(info, touch.head))
     return SourceDescription(view_shape(touch.image, head), len(head.length), info=info)
