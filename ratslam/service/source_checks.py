@@ -313,8 +313,9 @@ def check_source(
     Raises:
         InputError: as `find_parts`, or the source refuses its settings, as a file that is missing.
     """
-    named = {"settings": (SOURCES, name, "check source"), "touch": (TOUCH, touch, "--touch")}
-    parts = find_parts(named, assignments)
+    parts = find_parts(
+        {"settings": (SOURCES, name, "check source"), "touch": (TOUCH, touch, "--touch")}, assignments
+    )
     frontend = None
     if touch is not None:
         given = parts["touch"][1]
@@ -453,8 +454,9 @@ def check_touch(name: str, assignments: Sequence[str] = (), source: str | None =
     Raises:
         InputError: as `find_parts`.
     """
-    named = {"settings": (TOUCH, name, "check touch"), "source": (SOURCES, source, "--source")}
-    parts = find_parts(named, assignments)
+    parts = find_parts(
+        {"settings": (TOUCH, name, "check touch"), "source": (SOURCES, source, "--source")}, assignments
+    )
     readings = None
     if source is not None:
         entry, settings = parts["source"]
