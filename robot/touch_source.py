@@ -100,7 +100,7 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
     """The source, its whisker readings turned into observations.
 
     Args:
-        config: with the whiskers of the source (`head_config_of`, `report_config_of`).
+        config: with the whiskers of the source (`touch_config_of`).
 
     Raises:
         InputError: the source has another number of whiskers than the configuration, or lacks a required
@@ -118,6 +118,16 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
         templates = _strain_templates_of(source, config.reports)
         return TouchSource(source, lambda: ReportFrontend(config.reports, templates), "touch.reports.mounts")
     return TouchSource(source, lambda: Frontend(config, info.calibration), "touch.head")
+
+
+def touch_config_of(info: SourceInfo, config: TouchConfig) -> TouchConfig:
+    """The configuration with the whiskers of a source, see `head_config_of` and `report_config_of`.
+
+    Raises:
+        InputError: as `head_config_of`.
+    """
+    heads = {"head": head_config_of(info, config.head), "reports": report_config_of(info, config.reports)}
+    return config.model_copy(update=heads)
 
 
 def head_config_of(info: SourceInfo, config: HeadConfig) -> HeadConfig:

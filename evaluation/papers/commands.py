@@ -109,7 +109,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def _add_rows(
-    names: Commands, name: str, command: Callable[..., int], title: str, rows: Iterable[str], first: int
+    names: Commands, name: str, command: Callable[..., Any], title: str, rows: Iterable[str], first: int
 ) -> CommandParser:
     """Registers a set of tables and figures, of which each is a row; its parser.
 
@@ -158,7 +158,7 @@ def _figure(arguments: argparse.Namespace) -> int:
     return INTERRUPTED if interrupted else 0
 
 
-def _threshold(arguments: argparse.Namespace) -> int:
+def _threshold(arguments: argparse.Namespace) -> None:
     prepare_jax(keep_compiled=False)
     from evaluation.papers.salman2016.threshold_tuning import tune_threshold
     from ratslam.runs.settings.strict_yaml import load, override
@@ -167,10 +167,9 @@ def _threshold(arguments: argparse.Namespace) -> int:
     document = override(load(path), arguments.set)
     for line in tune_threshold(document, path.parent, arguments.workers, arguments.output):
         print(line)
-    return 0
 
 
-def _train(arguments: argparse.Namespace) -> int:
+def _train(arguments: argparse.Namespace) -> None:
     from evaluation.papers.fox2012.template_training import drive_held_out, render_drives
     from robot.simulation.create.simulated_session import train_strain_templates
 
@@ -183,10 +182,9 @@ def _train(arguments: argparse.Namespace) -> int:
     templates.write(arguments.output)
     print(render_drives(drive_held_out(create_simulation, templates), templates.training.repeats))
     print(f"\nwrote {arguments.output}; `touch.reports.templates: {arguments.output}` uses it")
-    return 0
 
 
-def _figures(arguments: argparse.Namespace) -> int:
+def _figures(arguments: argparse.Namespace) -> None:
     """The figures of pose cells, or those of real recordings."""
     from evaluation.papers.tables.markdown import select_rows
     from evaluation.papers.tables.recordings import DATA, UNPROVEN, real_recordings
@@ -208,10 +206,9 @@ def _figures(arguments: argparse.Namespace) -> int:
     for line in write_page(page, places, names, measure, ending):
         print(line, flush=True)
     print(f"wrote {page}")
-    return 0
 
 
-def _maps(arguments: argparse.Namespace) -> int:
+def _maps(arguments: argparse.Namespace) -> None:
     prepare_jax(keep_compiled=False)
     from evaluation.papers.maps.operations import Methods, reproduce_maps
     from evaluation.papers.tables.markdown import select_rows
@@ -223,7 +220,6 @@ def _maps(arguments: argparse.Namespace) -> int:
     ):
         print(line, flush=True)
     print(f"wrote {arguments.output / 'maps.md'} and {arguments.output / 'maps.csv'}")
-    return 0
 
 
 BACKENDS = ("recall", "classic")
@@ -315,14 +311,13 @@ def _add_against(parser: argparse.ArgumentParser, file: str) -> None:
     )  # fmt: skip
 
 
-def _print_table(arguments: argparse.Namespace) -> int:
+def _print_table(arguments: argparse.Namespace) -> None:
     prepare_jax(keep_compiled=False)
     lines = _timed_lines if arguments.table in TIMED else _table_lines
     for line in lines(arguments.table, arguments):
         print(line, flush=True)
     if arguments.file and arguments.output is not None:
         print(f"\nwrote {arguments.output / arguments.file}")
-    return 0
 
 
 def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:

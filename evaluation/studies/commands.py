@@ -218,7 +218,7 @@ def _cells(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _size(arguments: argparse.Namespace) -> int:
+def _size(arguments: argparse.Namespace) -> None:
     if arguments.cycles < FEWEST_CYCLES:
         raise InputError("--cycles", str(arguments.cycles), f"{FEWEST_CYCLES} or more")
     _prepare()
@@ -244,4 +244,3 @@ def _size(arguments: argparse.Namespace) -> int:
     print(render_trial_runs(runs))
     text = changed_settings_yaml(found)
     print(f"\nFor {path.name}:\n\n{text}" if text else f"\n{path.name} has these settings already")
-    return 0

@@ -68,7 +68,7 @@ def _run_command(arguments: argparse.Namespace) -> int:
     try:
         if getattr(arguments, "output", None) is not None:
             arguments.check(arguments.output)
-        code: int = arguments.command(arguments)
+        code: int = arguments.command(arguments) or 0
         sys.stdout.flush()
         return code
     except InputError as error:

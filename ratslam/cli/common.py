@@ -65,6 +65,10 @@ class CommandParser(argparse.ArgumentParser):
         names = ("-o", "--output") if name == "-o" else (name,)
         self.add_argument(*names, type=Path, metavar=metavar, help=help, **options)
 
+    def add_flag(self, name: str, help: str) -> None:
+        """Adds an option without a value."""
+        self.add_argument(name, action="store_true", help=help)
+
 
 class Commands:
     """The commands of a parser: of the program, or of a command that has commands of its own.
@@ -85,7 +89,7 @@ class Commands:
     def add(
         self,
         name: str,
-        run: Callable[[argparse.Namespace], int] | None,
+        run: Callable[[argparse.Namespace], int | None] | None,
         help: str,
         example: str,
         group: str = "",
@@ -93,8 +97,8 @@ class Commands:
         """Registers a command.
 
         Args:
-            run: takes the parsed arguments, returns the exit code; None for a command with commands of its
-                own (`Commands(parser)` adds them).
+            run: takes the parsed arguments, returns the exit code or nothing for 0; None for a command with
+                commands of its own (`Commands(parser)` adds them).
             help: one line, at most 60 characters.
             example: the arguments of a call that works, without `ratslam`.
             group: heading under which the program's help lists it.

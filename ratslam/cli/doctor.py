@@ -32,9 +32,7 @@ def add_commands(commands: Commands) -> None:
         "with -o: a run directory or map of the same sensor, whose view, cells and method to take, so "
         "that the recording can be localised in it or continue it",
     )  # fmt: skip
-    doctor.add_argument(
-        "--live", action="store_true", help="check the robot of a live session; moves nothing"
-    )
+    doctor.add_flag("--live", "check the robot of a live session; moves nothing")
     add_set(doctor)
 
     fit = commands.add(
@@ -94,7 +92,7 @@ def _check_recording(arguments: argparse.Namespace) -> Diagnosis:
     return diagnosis._replace(advice=(*diagnosis.advice, f"python -m ratslam run {output}"))
 
 
-def _fit(arguments: argparse.Namespace) -> int:
+def _fit(arguments: argparse.Namespace) -> None:
     if arguments.seed < 0:
         raise InputError("--seed", str(arguments.seed), "a non-negative integer")
     prepare_jax()
@@ -109,7 +107,6 @@ def _fit(arguments: argparse.Namespace) -> int:
         text = rig.file_text(str(arguments.record))
         make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
         print(f"{output}: written")
-    return 0
 
 
 def _config_of(arguments: argparse.Namespace) -> RunConfig:

@@ -49,10 +49,10 @@ def add_commands(commands: Commands) -> None:
     emulate.add_argument(
         "--host", metavar="HOST", help="address to listen on (default: from the configuration)"
     )
-    emulate.add_argument(
-        "--open-to-network", action="store_true",
-        help="listen on any address: anyone who reaches it may command, fault or stop the emulator",
-    )  # fmt: skip
+    emulate.add_flag(
+        "--open-to-network",
+        "listen on any address: anyone who reaches it may command, fault or stop the emulator",
+    )
     emulate.add_argument("--ur-host", metavar="HOST", help="address of the arm that carries the head")
 
 

@@ -26,11 +26,11 @@ def add_map(commands: Commands) -> None:
     kinds = Commands(commands.add("map", None, help, "map info runs/square", "maps"))
     info = kinds.add("info", _info, "say what is in a map", "map info runs/square")
     _add_map(info)
-    _add_json(info)
+    info.add_flag("--json", "print JSON")
     diff = kinds.add("diff", _diff, "say what differs between two maps", "map diff runs/square runs/again")
     _add_map(diff)
     diff.add_path("other", "MAP", "the map to compare with it")
-    _add_json(diff)
+    diff.add_flag("--json", "print JSON")
     undo = kinds.add(
         "undo", _undo, "remove a closure sequence from a map", "map undo runs/square 0 -o runs/undone.npz"
     )
@@ -58,10 +58,6 @@ def _add_map(parser: CommandParser) -> None:
     parser.add_path("map", "MAP", "a run directory or a map file")
 
 
-def _add_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print JSON")
-
-
 def _read(path: Path) -> SavedMap:
     prepare_jax()
     from ratslam.runs.saved_map import read_map
@@ -69,14 +65,14 @@ def _read(path: Path) -> SavedMap:
     return read_map(path, tell)
 
 
-def _info(arguments: argparse.Namespace) -> int:
+def _info(arguments: argparse.Namespace) -> None:
     saved = _read(arguments.map)
     from ratslam.runs.map_care import map_info
 
     info = map_info(saved)
     if arguments.json:
         print(json.dumps(info, indent=2))
-        return 0
+        return
     box = "{:.2f}, {:.2f} to {:.2f}, {:.2f} m".format(*info["box_m"]) if info["box_m"] else "empty"
     lines = [
         f"map         {info['path']}, {info['format']}, sha256 {info['digest'][:12]}",
@@ -106,20 +102,19 @@ def _info(arguments: argparse.Namespace) -> int:
     elif info["unjudged"]:
         lines.append(f"doubt       none: {info['unjudged']}")
     print("\n".join(lines))
-    return 0
 
 
-def _diff(arguments: argparse.Namespace) -> int:
+def _diff(arguments: argparse.Namespace) -> None:
     first, second = _read(arguments.map), _read(arguments.other)
     from ratslam.runs.map_care import map_difference
 
     found = map_difference(first, second)
     if arguments.json:
         print(json.dumps(found, indent=2))
-        return 0
+        return
     if found["same"]:
         print("the same map")
-        return 0
+        return
     lines = [
         "steps     {} and {}".format(*found["steps"]),
         "places    {common} in both, {removed} only in the first, {added} only in the second".format(**found),
@@ -135,10 +130,9 @@ def _diff(arguments: argparse.Namespace) -> int:
     lines.append(f"sensor    {found['sensor'] or 'the same'}")
     lines += [f"setting   {key}: {one!r} and {other!r}" for key, (one, other) in found["settings"].items()]
     print("\n".join(lines))
-    return 0
 
 
-def _undo(arguments: argparse.Namespace) -> int:
+def _undo(arguments: argparse.Namespace) -> None:
     output: Path | None = arguments.output
     prepare_jax()
     from ratslam.runs.folder_change import finish_change
@@ -148,19 +142,16 @@ def _undo(arguments: argparse.Namespace) -> int:
         output = arguments.map = replaced_file(arguments.map)
         finished = finish_change(output.parent)
         if finished is not None:
-            folder = output.parent
-            print(f"{folder}: the undo of sequence {finished}, which had been cut off, is complete")
+            print(f"{output.parent}: the undo of sequence {finished}, which had been cut off, is complete")
         if finished == str(arguments.sequence):
-            return 0
-    saved = _read(arguments.map)
-    rewritten = undo_sequence(saved, arguments.sequence, output)
+            return
+    rewritten = undo_sequence(_read(arguments.map), arguments.sequence, output)
     print(f"{output}: the map without sequence {arguments.sequence}")
     if rewritten:
         print(f"{output.parent}: trajectory, graph, closures and map.png follow it")
-    return 0
 
 
-def _crop(arguments: argparse.Namespace) -> int:
+def _crop(arguments: argparse.Namespace) -> None:
     prepare_jax()
     from ratslam.places.crop import keyframes_in_box, keyframes_of_piece, keyframes_of_steps
     from ratslam.runs.map_care import Choose, crop_saved
@@ -183,7 +174,6 @@ def _crop(arguments: argparse.Namespace) -> int:
     saved = _read(arguments.map)
     count = crop_saved(saved, choose, arguments.output)
     print(f"{arguments.output}: {count} of {saved.steps} steps")
-    return 0
 
 
 CONFIGURATIONS = (".yaml", ".yml", "")
@@ -211,11 +201,10 @@ def _localise(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.report.verdict import summarise
     from ratslam.runs.localise import check_assignments, localise, recorded_alike
-    from ratslam.runs.saved_map import read_map
     from ratslam.runs.settings.run_config import load_config
     from ratslam.service.viewer_link import open_viewer
 
-    target, saved = open_target(arguments), read_map(arguments.map, tell)
+    target, saved = open_target(arguments), _read(arguments.map)
     file: Path = arguments.recording
     if file.suffix in CONFIGURATIONS and not file.is_dir():
         config = load_config(file, arguments.set)
@@ -242,16 +231,15 @@ def add_merge(commands: Commands) -> None:
     merge.add_path("maps", "MAP", "run directories or map files", nargs="+")
     help = "the new map: a file that ends in .npz, or a folder for it with its trajectory and graph"
     merge.add_path("-o", "MAP", help, required=True)
-    merge.add_argument("--json", action="store_true", help="print JSON")
+    merge.add_flag("--json", "print JSON")
 
 
-def _merge(arguments: argparse.Namespace) -> int:
+def _merge(arguments: argparse.Namespace) -> None:
     prepare_jax()
     from ratslam.runs.merge import describe_merge, merge_maps
 
     report = merge_maps(arguments.maps, arguments.output, tell)
     print(json.dumps(report, indent=2) if arguments.json else describe_merge(report))
-    return 0
 
 
 Place = tuple[float, float] | int
@@ -280,7 +268,7 @@ def add_path(commands: Commands) -> None:
         help="least expected time (default), or RatSLAM's goal temporal map",
     )  # fmt: skip
     path.add_path("-o", "PNG", "draw the way to a new file", check=_require_new_picture)
-    path.add_argument("--json", action="store_true", help="print JSON")
+    path.add_flag("--json", "print JSON")
 
 
 def _path(arguments: argparse.Namespace) -> int:
@@ -289,9 +277,8 @@ def _path(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from ratslam.live.goal_planner import draw_map_way, find_map_way
     from ratslam.places.route import NoWay
-    from ratslam.runs.saved_map import read_map
 
-    saved = read_map(arguments.map, tell)
+    saved = _read(arguments.map)
     made = saved.open_session().map
     try:
         way = find_map_way(made, saved, start, goal, arguments.mode)
@@ -308,8 +295,7 @@ def _path(arguments: argparse.Namespace) -> int:
         f"{len(places)} experiences from {places[0]} to {places[-1]}: {way.length:.2f} m, {way.seconds:.0f} s"
     ]
     if not isinstance(goal, int):
-        apart = math.dist(way.poses[-1][:2], goal)
-        lines.append(f"ends {apart:.2f} m from {goal[0]:g},{goal[1]:g}")
+        lines.append(f"ends {math.dist(way.poses[-1][:2], goal):.2f} m from {goal[0]:g},{goal[1]:g}")
     elif places[-1] != goal:
         lines.append(f"ends at {places[-1]}, which is so near to {goal} that it counts as the same place")
     lines.append(

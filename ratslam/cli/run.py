@@ -27,7 +27,7 @@ def add_look(commands: Commands) -> None:
     watch.add_argument(
         "--every", type=float, default=2.0, metavar="SECONDS", help="time between updates (default 2)"
     )
-    watch.add_argument("--once", action="store_true", help="show the state once and exit")
+    watch.add_flag("--once", "show the state once and exit")
     watch.add_argument(
         "--patience", type=float, default=300.0, metavar="SECONDS",
         help="a run that writes nothing for this long counts as killed (default 300)",
@@ -52,7 +52,7 @@ def add_look(commands: Commands) -> None:
     score.add_path(
         "--relations", "CSV", "true relative poses (t1,t2,x,y,z,roll,pitch,yaw) for the Energy Metric"
     )
-    score.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    score.add_flag("--json", "print JSON instead of a table")
 
     report = commands.add(
         "report", _report, "write a page (HTML) about a run, or several compared",
@@ -65,7 +65,7 @@ def add_look(commands: Commands) -> None:
     )  # fmt: skip
 
 
-def _watch(arguments: argparse.Namespace) -> int:
+def _watch(arguments: argparse.Namespace) -> None:
     from evaluation.artifacts.manifest import RUNNING
     from evaluation.monitor import KILLED, WATCH_IMAGE, watch_run
 
@@ -83,10 +83,9 @@ def _watch(arguments: argparse.Namespace) -> int:
     if seen.status == KILLED or (silent and not arguments.once):
         print(f"{silent}the run was killed; `run --continue {arguments.directory}` continues")
     print(f"{arguments.directory / WATCH_IMAGE} shows its map")
-    return 0
 
 
-def _score(arguments: argparse.Namespace) -> int:
+def _score(arguments: argparse.Namespace) -> None:
     from evaluation.artifacts.run_reader import read_run
     from evaluation.metrics.energy_metric import read_relations
     from evaluation.metrics.exm import ExmConfig, read_experience_log
@@ -100,13 +99,11 @@ def _score(arguments: argparse.Namespace) -> int:
     if arguments.log.is_dir():
         relations = read_relations(arguments.relations) if arguments.relations else None
         metrics = build_metrics([PluginConfig(plugin=name) for name in arguments.metrics or []])
-        card = score_run(
-            read_run(arguments.log), arguments.log.name, exm=exm, relations=relations, metrics=metrics
-        )
+        run = read_run(arguments.log)
+        card = score_run(run, arguments.log.name, exm=exm, relations=relations, metrics=metrics)
     else:
         card = score_log(read_experience_log(arguments.log), arguments.log.stem, exm=exm)
     print(card.model_dump_json(indent=2) if arguments.json else _render_scores(arguments.log, card))
-    return 0
 
 
 def _render_scores(path: Path, card: Scorecard) -> str:
@@ -122,12 +119,11 @@ def _render_scores(path: Path, card: Scorecard) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def _report(arguments: argparse.Namespace) -> int:
+def _report(arguments: argparse.Namespace) -> None:
     from ratslam.runs.map_results import write_report
 
     write_report(arguments.runs, arguments.output)
     print(f"{arguments.output}: open it in a browser; it needs no network")
-    return 0
 
 
 class _StatusLine:
@@ -163,10 +159,8 @@ def add_run(commands: Commands) -> None:
         "last sample mapped; another begins a separate piece, joined once its views place it in the map, and "
         "is refused in maps of methods other than `backend: recall`, which are one piece", dest="resume",
     )  # fmt: skip
-    run.add_argument("--full", action="store_true", help="print all figures, as `score` does")
-    run.add_argument(
-        "--report", action="store_true", help="write map_results.html, a page, to the run directory"
-    )
+    run.add_flag("--full", "print all figures, as `score` does")
+    run.add_flag("--report", "write map_results.html, a page, to the run directory")
     add_rerun(run)
 
     simulate = commands.add(
@@ -175,9 +169,7 @@ def add_run(commands: Commands) -> None:
     )  # fmt: skip
     add_config(simulate)
     simulate.add_path("-o", "MCAP", "the new file", required=True)
-    simulate.add_argument(
-        "--raw", action="store_true", help="record raw 2 kHz samples instead of contact features"
-    )
+    simulate.add_flag("--raw", "record raw 2 kHz samples instead of contact features")
 
 
 def add_run_directory(parser: CommandParser) -> None:

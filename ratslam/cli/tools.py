@@ -60,7 +60,7 @@ def add_tools(commands: Commands) -> None:
     completion.set_defaults(program=commands.parser)
 
 
-def _recover(arguments: argparse.Namespace) -> int:
+def _recover(arguments: argparse.Namespace) -> None:
     from robot.recordings.mcap_reader import UNCLOSED
     from robot.recordings.mcap_writer import recover
 
@@ -68,10 +68,9 @@ def _recover(arguments: argparse.Namespace) -> int:
     lost = f"; the rest is lost: {reason}" if reason else ""
     lost = f"; all that was written: {UNCLOSED}" if reason == UNCLOSED else lost
     print(f"{arguments.output}: {samples} samples{lost}")
-    return 0
 
 
-def _convert(arguments: argparse.Namespace) -> int:
+def _convert(arguments: argparse.Namespace) -> None:
     from ratslam.runs.settings.openratslam import convert_parameters
     from ratslam.runs.settings.strict_yaml import dump_data
 
@@ -86,10 +85,9 @@ def _convert(arguments: argparse.Namespace) -> int:
         make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
     else:
         print(text, end="")
-    return 0
 
 
-def _schema(arguments: argparse.Namespace) -> int:
+def _schema(arguments: argparse.Namespace) -> None:
     from ratslam.runs.settings.run_config import RunConfig
     from ratslam.runs.settings.strict_yaml import schema
 
@@ -98,24 +96,21 @@ def _schema(arguments: argparse.Namespace) -> int:
         write_text_atomically(arguments.output, text)
     else:
         print(text, end="")
-    return 0
 
 
-def _version(arguments: argparse.Namespace) -> int:
+def _version(arguments: argparse.Namespace) -> None:
     import platform
     from importlib.metadata import version
 
     print(f"ratslam {version('ratslam')}")
     print(f"Python {platform.python_version()}, jax {version('jax')}, jaxlib {version('jaxlib')}")
     print(platform.platform())
-    return 0
 
 
-def _completion(arguments: argparse.Namespace) -> int:
+def _completion(arguments: argparse.Namespace) -> None:
     import shtab
 
     print(shtab.complete(arguments.program, arguments.shell))
-    return 0
 
 
 FAILED = 1
@@ -207,7 +202,7 @@ def add_export(commands: Commands) -> None:
     export.add_argument("--spike-seed", type=_seed, default=0, metavar="N", help="spikes: seed (default 0)")
 
 
-def _export(arguments: argparse.Namespace) -> int:
+def _export(arguments: argparse.Namespace) -> None:
     from ratslam.service.export_formats import export_run
     from ratslam.service.spikes import SpikeConfig
 
@@ -218,7 +213,6 @@ def _export(arguments: argparse.Namespace) -> int:
         SpikeConfig(peak_rate=arguments.peak_rate, seed=arguments.spike_seed),
     )
     print(f"{arguments.output}: written")
-    return 0
 
 
 def _rate(text: str) -> float:

@@ -95,9 +95,8 @@ class Map(Protocol):
         Raises:
             InputError: the map cannot hold pieces.
         """
-        raise InputError(
-            "map", "a method whose map is one piece", "`backend: recall`, whose map can begin a new piece"
-        )
+        expected = "`backend: recall`, whose map can begin a new piece"
+        raise InputError("map", "a method whose map is one piece", expected)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         """[3] the robot's current pose in the map frame: x m, y m, heading rad."""

@@ -8,6 +8,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
@@ -75,6 +76,12 @@ class Estimate(NamedTuple):
     previous: Array
     action: Array
     lost: Array
+
+    @classmethod
+    def without_place(cls, pose: Array, spread: Array, lost: Array) -> Estimate:
+        """That of a kernel which assigns no place: its map does, or it has none."""
+        none = jnp.int32(-1)
+        return cls(pose, spread, none, none, jnp.int32(Action.NONE), lost)
 
 
 class Localisation(IntEnum):

@@ -176,17 +176,11 @@ class Session:
     def arrays(self) -> dict[str, np.ndarray]:
         """The whole session for a checkpoint; a restored session continues bit for bit."""
         leaves = jax.tree.leaves(self.state)
-        return (
-            {f"state/{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
-            | {f"map/{name}": value for name, value in self.map.arrays().items()}
-            | {
-                "steps": np.array(self.steps),
-                "earlier": np.array(self.earlier),
-                "reserve": np.array(self.reserve),
-                "capacity": np.array(self._capacity),
-                "sides": np.array(self._sides, np.int64),
-            }
-        )
+        arrays = {f"state/{k}": np.asarray(leaf) for k, leaf in enumerate(leaves)}
+        arrays |= {f"map/{name}": value for name, value in self.map.arrays().items()}
+        counts = {"steps": self.steps, "earlier": self.earlier, "reserve": self.reserve}
+        arrays |= {name: np.array(count) for name, count in counts.items()}
+        return arrays | {"capacity": np.array(self._capacity), "sides": np.array(self._sides, np.int64)}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Continues from a checkpoint made by `arrays`; of one without a state, which an earlier version
@@ -256,9 +250,8 @@ class Session:
         for k, observation in enumerate(observations):
             chunk.write(k, observation)
         steps = []
-        for observation, (estimate, evidence, *probed) in zip(
-            observations, self._compute(chunk, count), strict=True
-        ):
+        results = self._compute(chunk, count)
+        for observation, (estimate, evidence, *probed) in zip(observations, results, strict=True):
             estimate = self.map.update(observation, estimate, evidence)
             steps.append(Step(estimate, evidence, self.map.pose(estimate), self.map.doubt(), *probed))
         self.steps += count

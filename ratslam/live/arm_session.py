@@ -20,19 +20,11 @@ from ratslam.runs.localise import localising
 from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
-from robot.live.arm_route import (
-    ArmRoute,
-    MovableArm,
-    arm_routes,
-    check_targets,
-    plan_path,
-    plan_scene,
-    whole_path,
-)
+from robot.live import arm_route
 from robot.live.live_rig import Rig
 from robot.live.polling import SessionFault, session_fault
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
-from robot.sources.source import SourceInfo
+from robot.sources.source import SourceDescription, SourceInfo
 from robot.world.maze import POSE_CELL_SIZE
 from robot.world.scene import HeadPath, maze_info
 from tactile.calibration import Calibration, calibrate
@@ -84,7 +76,7 @@ class GoalSteering:
         self._rig, self._mapper, self._whisks = rig, mapper, whisks
         self._mapped = self._seen = 0  # results taken; whisks that the route has taken note of
 
-    def advance(self, arm: MovableArm) -> bool:
+    def advance(self, arm: arm_route.MovableArm) -> bool:
         """See `robot.live.arm_route.ArmRoute`."""
         if not self.route.drive.finished:
             self._take_results()
@@ -137,8 +129,8 @@ def prepare_arm_session(config: RunConfig, directory: Path) -> Callable[[Callabl
     assert config.live is not None
     config, goals = (config, None) if config.live.plan.goal is None else plan_goals(config)
     assert config.live is not None
-    path = plan_path(config.live, ur10_head(config.touch.head))
-    check_targets(config.live, path)
+    path = arm_route.plan_path(config.live, ur10_head(config.touch.head))
+    arm_route.check_targets(config.live, path)
     return lambda stopped: ArmSession(config, path, directory, stopped, goals)
 
 
@@ -163,28 +155,25 @@ class ArmSession(LiveRobot):
     ) -> None:
         assert config.live is not None
         self._config = config
-        self._approach, self._descent, self._route = arm_routes(config.live, path)
+        self._approach, self._descent, self._route = arm_route.arm_routes(config.live, path)
         self.rig = Rig(config.live, config.touch.head, stopped)
         live, plan, head = config.live, config.live.plan, ur10_head(config.touch.head)
-        whole, rate = whole_path(live, head), plan.whisking.rate
+        whole, rate = arm_route.whole_path(live, head), plan.whisking.rate
         rows = ceil(1.5 * whole.duration * rate) if live.whisks is None else live.whisks
-        maze = None if live.waypoints else maze_info(plan_scene(plan, head).maze, plan.maze, plan.seed)
-        provenance = {"live": live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})}
-        self.job = MappingJob(
-            mapped_config(config, directory, rows),
-            SourceInfo(
-                raw_whiskers=True,
-                cell_size=POSE_CELL_SIZE,
-                head=config.touch.head,
-                maze=maze,
-                provenance=provenance,
-            ),
-            directory,
-            view_shape(config.touch.image, head),
-            len(head.length),
-            rate,
-            float(np.abs(whole.pose[:, :2] - whole.pose[0, :2]).max()),
+        maze = (
+            None if live.waypoints else maze_info(arm_route.plan_scene(plan, head).maze, plan.maze, plan.seed)
         )
+        provenance = {"live": live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})}
+        info = SourceInfo(
+            raw_whiskers=True,
+            cell_size=POSE_CELL_SIZE,
+            head=config.touch.head,
+            maze=maze,
+            provenance=provenance,
+        )
+        source = SourceDescription(view_shape(config.touch.image, head), len(head.length), rate, info)
+        extent = float(np.abs(whole.pose[:, :2] - whole.pose[0, :2]).max())
+        self.job = MappingJob(mapped_config(config, directory, rows), source, directory, extent)
         self.total = live.whisks or (None if goals else ceil(path.duration * rate))
         self._goals = goals
         self._steering: GoalSteering | None = None
@@ -226,7 +215,7 @@ class ArmSession(LiveRobot):
             steering = self._steering.status() if self._steering else ""
             tell(f"{mapper_status(mapper)}{steering}{late}, {lost}")
 
-        route: ArmRoute = self._route
+        route: arm_route.ArmRoute = self._route
         if self._goals is not None:
             route = self._steering = GoalSteering(self._goals, self.rig, mapper, self._whisks)
         run_whisk_loop(self.rig, route, mapper, count)

@@ -16,6 +16,7 @@ from ratslam.runs.settings.run_config import RunConfig
 from robot.live.create_rig import CreateRig, run_create_loop
 from robot.simulation.create.simulated_session import describe_create
 from robot.simulation.create.state_machine import CreateState
+from robot.sources.source import SourceDescription
 from robot.world.arena import make_arena, wall_segments
 from tactile.base.errors import InputError
 from tactile.base.types import StepEnd
@@ -59,15 +60,11 @@ class CreateSession(LiveRobot):
         offset = wall_segments(arena).reshape(-1, 2) - [x, y]
         c, s = np.cos(heading), np.sin(heading)
         ahead, left = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
-        self.job = MappingJob(
-            mapped_config(config, directory, plan.reports or ceil(60 * plan.minutes / SHORTEST_STEP)),
-            info.model_copy(update={"provenance": {**info.provenance, "live": live}}),
-            directory,
-            (1, whiskers, 1),
-            whiskers,
-            1 / plan.behaviour.step,
-            float(np.abs([ahead, left]).max()),
-        )
+        info = info.model_copy(update={"provenance": {**info.provenance, "live": live}})
+        source = SourceDescription((1, whiskers, 1), whiskers, 1 / plan.behaviour.step, info)
+        rows = plan.reports or ceil(60 * plan.minutes / SHORTEST_STEP)
+        extent = float(np.abs([ahead, left]).max())
+        self.job = MappingJob(mapped_config(config, directory, rows), source, directory, extent)
         self.total = plan.reports
         self._ends: Counter[StepEnd] = Counter()
 

@@ -343,9 +343,11 @@ class GoalRoute:
             self._unseen += float(np.hypot(step[0], step[1]))
         self._arm_pose = arm_pose
         self._recent = [*self._recent, (arm_pose, points)][-RECENT:]
-        if estimate is not None and not self._correct(estimate, self._recent_points(arm_pose)):
+        poses, felt = zip(*self._recent, strict=True)  # the last contacts, as seen from the arm's pose now
+        recent = placed_points(np.array([between(arm_pose, before) for before in poses]), felt)
+        if estimate is not None and not self._correct(estimate, recent):
             estimate = None
-        sure = self.pose is not None and self._align(estimate, arm_pose)
+        sure = self.pose is not None and self._align(estimate, recent)
         if self.pose is None or (estimate is None and self._unseen > self.drive.config.coast):
             self.pose = None
             return self.rest()
@@ -360,10 +362,9 @@ class GoalRoute:
         self._target = None
         return self.drive.observe(None, np.zeros((0, 2)))
 
-    def _align(self, estimate: np.ndarray | None, arm_pose: np.ndarray) -> bool:
-        """Aligns the last contacts with those of the map; returns whether the pose is sure then."""
+    def _align(self, estimate: np.ndarray | None, points: np.ndarray) -> bool:
+        """Aligns the last contacts [n, 2] with those of the map; returns whether the pose is sure then."""
         assert self.pose is not None
-        points = self._recent_points(arm_pose)
         self.pose = self._contacts.align(self.pose, points)
         # The map does not have the obstacles that were found on the way.
         found = self.drive.obstacles
@@ -373,11 +374,6 @@ class GoalRoute:
             self._unseen = self._unseen if agrees else np.inf
             return False
         return agrees and bool(np.hypot(*(self.pose - estimate)[:2]) <= self.drive.off_way)
-
-    def _recent_points(self, arm_pose: np.ndarray) -> np.ndarray:
-        """[n, 2] contacts of the last whisks, as seen from a pose of the arm, m."""
-        poses, points = zip(*self._recent, strict=True)
-        return placed_points(np.array([between(arm_pose, before) for before in poses]), points)
 
     def _correct(self, estimate: np.ndarray, points: np.ndarray) -> bool:
         """Moves the pose towards the estimate, unless only the pose as it is agrees with the last contacts

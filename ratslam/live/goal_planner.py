@@ -12,17 +12,8 @@ from evaluation.plots.map_plot import draw_way
 from ratslam.core.backend import Map
 from ratslam.mapping.appearance import WhiskerAppearance
 from ratslam.mapping.map import KeyframeMap
+from ratslam.places import route
 from ratslam.places.contact_alignment import RememberedContacts, placed_points
-from ratslam.places.route import (
-    Mode,
-    Travel,
-    Way,
-    experiences_near,
-    find_way,
-    nearest_experience,
-    position,
-    travel_graph,
-)
 from ratslam.recall.whisker_likelihood import level_heights
 from ratslam.runs.saved_map import SavedMap
 from robot.live.live_config import GoalConfig
@@ -57,8 +48,8 @@ class GoalPlanner:
 
     def __init__(self, experiences: networkx.DiGraph, config: GoalConfig, motion: MotionConfig) -> None:
         self._experiences, self._config = experiences, config
-        self._travel = Travel(motion.speed, motion.turn_rate)
-        graph = travel_graph(experiences, self._travel)
+        self._travel = route.Travel(motion.speed, motion.turn_rate)
+        graph = route.travel_graph(experiences, self._travel)
         self.goals = [
             experience_at(graph, goal, config.farthest, f"live.plan.goal.to[{k}]")
             for k, goal in enumerate(config.to)
@@ -72,12 +63,12 @@ class GoalPlanner:
             NoWay: there is none.
         """
         config = self._config
-        graph = travel_graph(self._experiences, self._travel, obstacles, config.standoff)
-        start = nearest_experience(graph, pose, config.farthest, HEADING_RADIUS)
+        graph = route.travel_graph(self._experiences, self._travel, obstacles, config.standoff)
+        start = route.nearest_experience(graph, pose, config.farthest, HEADING_RADIUS)
         if start is None:
             return None
-        goals = experiences_near(graph, self.goals[goal], config.tolerance)
-        return find_way(graph, start, goals, config.mode).poses
+        goals = route.experiences_near(graph, self.goals[goal], config.tolerance)
+        return route.find_way(graph, start, goals, config.mode).poses
 
 
 def contact_map(made: Map, image: ImageConfig, head: Head) -> RememberedContacts:
@@ -125,13 +116,13 @@ def experience_at(
     place = np.array(goal[:2], float)
     if not np.isfinite(place).all():
         raise InputError(where, f"({place[0]:g}, {place[1]:g})", "finite numbers x, y, m")
-    found = nearest_experience(graph, place, farthest)
+    found = route.nearest_experience(graph, place, farthest)
     if found is not None:
         return found
-    nearest = nearest_experience(graph, place, np.inf)
+    nearest = route.nearest_experience(graph, place, np.inf)
     if nearest is None:
         raise InputError(where, "a map without experiences", "a map with experiences")
-    x, y = position(graph, nearest)
+    x, y = route.position(graph, nearest)
     away = float(np.hypot(x - place[0], y - place[1]))
     text = f"({place[0]:g}, {place[1]:g}), {away:.2f} m from experience {nearest} at ({x:.2f}, {y:.2f})"
     cure = f"the nearest possible place is {x:.2f},{y:.2f}; map.png shows all, in the frame of the map"
@@ -146,8 +137,8 @@ def find_map_way(
     saved: SavedMap,
     start: tuple[float, float] | int | None,
     goal: tuple[float, float] | int,
-    mode: Mode = "time",
-) -> Way:
+    mode: route.Mode = "time",
+) -> route.Way:
     """The way from a place to another at the speed of a session's default motion.
 
     Args:
@@ -158,26 +149,22 @@ def find_map_way(
         InputError: a place is not on the map. NoWay: nothing joins the two.
     """
     motion = MotionConfig()
-    graph = travel_graph(made.graph(), Travel(motion.speed, motion.turn_rate))
+    graph = route.travel_graph(made.graph(), route.Travel(motion.speed, motion.turn_rate))
     if not len(graph):
         found = f"a map of `backend: {saved.config.backend}` without experiences, which a way leads along"
         raise InputError(str(saved.path), found, "a map of `backend: recall` or `backend: classic`")
     last = experience_at(graph, goal, FARTHEST, "--to")
     if start is None:
-        first = (
-            nearest_experience(graph, made.trajectory()[-1], FARTHEST, HEADING_RADIUS)
-            if saved.steps
-            else None
-        )
+        first = route.nearest_experience(graph, made.trajectory()[-1], FARTHEST, HEADING_RADIUS)
         if first is None:
             found = f"the map's last pose has no experience within {FARTHEST:g} m"
             raise InputError("--from", found, "a robot on driven ground", "give X,Y or an experience")
     else:
         first = experience_at(graph, start, FARTHEST, "--from")
-    return find_way(graph, first, experiences_near(graph, last, TOLERANCE), mode)
+    return route.find_way(graph, first, route.experiences_near(graph, last, TOLERANCE), mode)
 
 
-def draw_map_way(path: Path, made: Map, saved: SavedMap, way: Way) -> None:
+def draw_map_way(path: Path, made: Map, saved: SavedMap, way: route.Way) -> None:
     """Writes a picture of a way on its map."""
     graph, config = made.graph(), saved.config
     row = {place: k for k, place in enumerate(graph)}

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from tqdm import tqdm
@@ -25,7 +26,6 @@ from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
 from robot.live.selftest import check_disk, find_devices, start_and_check
 from robot.recordings.mcap_writer import Recorder
-from robot.sources.source import SourceDescription
 from tactile.base.files import require_new_file
 from tactile.calibration import Calibration
 
@@ -71,10 +71,10 @@ def run_live_session(
                     calibration = _prepare(robot, mapper, log)
                     log("armed")
                     armed(directory)
-                    job = robot.job
-                    info = job.info.model_copy(update={"calibration": calibration})
-                    source = SourceDescription(job.view_shape, job.whiskers, job.rate_hz, info)
-                    with LiveRecorder(Recorder(job.directory / RECORDING, source)) as rig.recorder:
+                    described = robot.job.source
+                    info = described.info.model_copy(update={"calibration": calibration})
+                    source = replace(described, info=info)
+                    with LiveRecorder(Recorder(directory / RECORDING, source)) as rig.recorder:
                         _run(robot, mapper)
                     fault = Fault(robot.end, f"{robot.count} {robot.unit}s", time.monotonic())
                 except SessionFault as error:

@@ -13,18 +13,18 @@ import queue
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Thread
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.processes import step_back, withheld_signals
-from robot.sources.source import ClosedSource, Sample, SourceInfo
+from robot.sources.source import ClosedSource, Sample, SourceDescription
 from tactile.base.errors import InputError
 from tactile.calibration import Calibration
 from tactile.whisker_geometry import ur10_head
@@ -39,19 +39,15 @@ class MappingJob(NamedTuple):
     """Input of the mapper before the first sample.
 
     Attributes:
-        config: its `recording` is the file that the session is recorded to. info: as in that file, without
-            the calibration, which follows.
-        directory: the new run directory. view_shape, whiskers, rate_hz: of the samples.
+        config: its `recording` is the file that the session is recorded to.
+        source: as in that file, without the calibration, which follows. directory: the new run directory.
         extent_m: largest distance from the start along x or y on the planned path, m.
         view: target of a live view, or None.
     """
 
     config: RunConfig
-    info: SourceInfo
+    source: SourceDescription
     directory: Path
-    view_shape: tuple[int, int, int]
-    whiskers: int
-    rate_hz: float
     extent_m: float
     view: str | None = None
 
@@ -75,7 +71,7 @@ class MappedSample(NamedTuple):
     points: np.ndarray
 
 
-class Mapper:
+class Mapper(AbstractContextManager["Mapper"]):
     """Handle of the mapper process; a context manager. The process starts at once, to be ready early.
 
     Args:
@@ -184,9 +180,6 @@ class Mapper:
             if isinstance(message, bool):
                 return
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self._process.join(0.0 if self._card is None else 5.0)
         self._process.kill()  # at the end of this process SIGTERM would be sent, which it does not get
@@ -205,9 +198,9 @@ class PipeSource(ClosedSource):
 
     name, digest, length = "live", "", None
 
-    def __init__(self, job: MappingJob, line: Connection) -> None:
-        self.rate_hz, self.view_shape, self.whiskers = job.rate_hz, job.view_shape, job.whiskers
-        self.info = job.info
+    def __init__(self, like: SourceDescription, line: Connection) -> None:
+        self.rate_hz, self.view_shape, self.whiskers = like.rate_hz, like.view_shape, like.whiskers
+        self.info = like.info
         self.interrupted = True  # until the parent sends the flag
         self.received, self.count = 0.0, 0
         self._line = line
@@ -245,18 +238,17 @@ def _map(line: Connection) -> None:
     from ratslam.runs.runner import check_finished_map, open_runner
     from ratslam.runs.settings.completion import complete
     from ratslam.service.viewer_link import open_viewer
+    from robot.sources.in_memory import NO_ODOMETRY
     from robot.touch_source import open_touch_source
-    from tactile.base.types import Odometry, observation
+    from tactile.base.types import observation
 
     job = line.recv()
-    with PipeSource(job, line) as fed, open_viewer(job.view) as observers:
+    with PipeSource(job.source, line) as fed, open_viewer(job.view) as observers:
         config = complete(job.config, fed, job.extent_m)
         source = open_touch_source(fed, config.touch)  # for its shapes: no sample is read without calibration
         check_finished_map(config, source)
         session = build_session(config, source)
-        still = Odometry(0.0, 0.0, 0.0, 0.0)
-        blank = observation(still, view_shape=source.view_shape, whiskers=source.whiskers)
-        session.warm(blank)
+        session.warm(observation(NO_ODOMETRY, view_shape=source.view_shape, whiskers=source.whiskers))
         gc.collect()
         gc.freeze()  # what compiling has left need not be searched again: a full collection takes 0.1 s
         line.send(True)

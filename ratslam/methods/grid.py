@@ -15,12 +15,13 @@ import numpy as np
 from jax import lax
 
 from ratslam.core.backend import Backend
-from ratslam.core.estimates import Action, Estimate, Scalar
+from ratslam.core.estimates import Estimate, Scalar
 from ratslam.grid import likelihoods, particles
 from ratslam.grid.config import GridConfig
 from ratslam.grid.contact_features import ContactFeatures, contact_features
 from ratslam.grid.map import GridMap
 from ratslam.grid.particles import COSINE, EVIDENCE, LAYERS, SINE, Particles
+from ratslam.methods.config import GridBackendConfig
 from tactile.base.errors import InputError
 from tactile.base.types import Array, MotionKind, Observation
 from tactile.whisker_geometry import PlanarWhiskers
@@ -150,8 +151,7 @@ class GridBackend(Backend):
         outcome = jnp.where(outside, GridOutcome.OUTSIDE, outcome)
         outcome = jnp.where(vanished, GridOutcome.VANISHED, outcome)
         outcome = jnp.where(clean, outcome, GridOutcome.NOT_FINITE).astype(jnp.int32)
-        place = jnp.int32(-1)  # a grid has no places
-        estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), vanished)
+        estimate = Estimate.without_place(pose, spread, vanished)
         evidence = GridEvidence(drawn.ancestor, poses, share, worth, outcome)
         touched = jnp.where(features.valid, features.touching, False)
         after = GridState(swarm, maps, wall_directions, motion, touched, jax.random.key_data(key))
@@ -306,20 +306,19 @@ class GridBackend(Backend):
         return particles.to_cells(particles.placed(pose, points), self.config.cell, self.side)
 
 
-def build(config: GridConfig, feelers: PlanarWhiskers | None, dtype: Any = np.float64) -> GridBackend:
+def build(settings: GridBackendConfig, feelers: PlanarWhiskers | None, dtype: Any) -> GridBackend:
     """The backend for a session with these whiskers.
 
     Raises:
         InputError: there are no whiskers, or the maps have more cells than int32 can index.
     """
     if feelers is None:
-        raise InputError(
-            "backend", "grid, for a recording without whiskers", "recall, or a recording with whiskers"
-        )
+        found = "grid, for a recording without whiskers"
+        raise InputError("backend", found, "recall, or a recording with whiskers")
+    config = settings.grid
     side = config.side or LIVE_SIDE
     if config.particles * LAYERS * np.ceil(side / config.cell) ** 2 > MAX_CELLS:
         found = f"{config.particles} particles with maps of {side:g} m in cells of {config.cell:g} m"
-        raise InputError(
-            "grid", found, "2^31 cells in all", "fewer particles, coarser cells or a smaller map"
-        )
+        cure = "fewer particles, coarser cells or a smaller map"
+        raise InputError("grid", found, "2^31 cells in all", cure)
     return GridBackend(config, feelers, side, dtype)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 
 from ratslam.core.backend import Backend, Map
-from ratslam.core.estimates import Action, Estimate, Scalar
+from ratslam.core.estimates import Estimate, Scalar
 from ratslam.core.session import finite_values
 from ratslam.mapping.ground import SESSION_WEIGHTING
 from ratslam.mapping.map import KeyframeMap
@@ -121,11 +121,8 @@ class LocaliseBackend(Backend):
             lambda: (memory, state.belief, self._views.no_look(memory)),
         )
         shifts = jnp.asarray(self._views.shifts)
-        place = jnp.int32(-1)
-        estimate = Estimate(
-            pose=jnp.zeros(3, recall.dtype), spread=jnp.zeros(3, recall.dtype), place=place, previous=place,
-            action=jnp.int32(Action.NONE), lost=jnp.bool_(True),
-        )  # fmt: skip
+        zero = jnp.zeros(3, recall.dtype)
+        estimate = Estimate.without_place(zero, zero, jnp.bool_(True))
         evidence = LocaliseEvidence(
             keyframe=jnp.where(is_keyframe, state.seen, -1),
             match=result.match,

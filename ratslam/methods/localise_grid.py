@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from ratslam.core.backend import Backend
-from ratslam.core.estimates import Action, Estimate, Scalar
+from ratslam.core.estimates import Estimate, Scalar
 from ratslam.grid.contact_features import contact_features
 from ratslam.grid.expectation import Expectation, draw_surfaces
 from ratslam.grid.localiser import GridLocaliser, Hypotheses, Search
@@ -138,9 +138,7 @@ class GridLocaliseBackend(Backend):
         outcome = jnp.where(vanished, GridLocaliseOutcome.VANISHED, outcome)
         outcome = jnp.where(failed, GridLocaliseOutcome.BEGUN_ANEW, outcome)
         outcome = jnp.where(clean, outcome, GridLocaliseOutcome.NOT_FINITE).astype(jnp.int32)
-        place = jnp.int32(-1)  # a grid has no places
-        spread = jnp.sqrt(jnp.diag(covariance))
-        estimate = Estimate(pose, spread, place, place, jnp.int32(Action.NONE), jnp.bool_(True))
+        estimate = Estimate.without_place(pose, jnp.sqrt(jnp.diag(covariance)), jnp.bool_(True))
         evidence = GridLocaliseEvidence(pose, covariance, share, odds, fall, worth, failed, outcome)
         touched = jnp.where(features.valid, features.touching, False)
         after = GridLocaliseState(known, motion, touched, jax.random.key_data(key))
@@ -159,7 +157,7 @@ def build(
     Raises:
         InputError: the map cannot be read, or was not made with these settings and whiskers.
     """
-    settings, method = config.localise, grid.build(config.grid, feelers, dtype)
+    settings, method = config.localise, grid.build(config, feelers, dtype)
     made = restore_map(settings, method.new_map(), "grid")
     here = settings.start == "here"
     return GridLocaliseBackend(made, settings.log_odds or LOG_ODDS, settings.particles, dtype, here)

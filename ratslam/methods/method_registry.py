@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
 
-from ratslam.classic import pose_cells
+from ratslam.classic.pose_cells import Outcome
 from ratslam.core.backend import Backend
 from ratslam.core.estimates import Scalar
 from ratslam.mapping.config import FULL, Ablation
@@ -66,41 +66,36 @@ class BackendEntry(NamedTuple):
         return self.outcomes(int(evidence.outcome)).name.lower()
 
 
+Build = Callable[[Any, Sensors, np.dtype], Backend]
+
+
+def _of_views(make: Callable[[Any, tuple[int, int, int], np.dtype], Backend]) -> Build:
+    """For a method that recognises views: it needs their shape alone."""
+    return lambda config, sensors, dtype: make(config, sensors.view_shape, dtype)
+
+
+def _of_feelers(make: Callable[[Any, PlanarWhiskers | None, np.dtype], Backend]) -> Build:
+    """For a method that maps contacts: it needs the whiskers alone."""
+    return lambda config, sensors, dtype: make(config, sensors.feelers, dtype)
+
+
 BACKENDS = Registry(
     "ratslam.backends",
     "backend",
     BackendEntry,
     {
-        "recall": BackendEntry(
-            RecallBackendConfig,
-            RecallEvidence,
-            RecallOutcome,
-            lambda config, sensors, dtype: RecallBackend(config, sensors.view_shape, dtype),
-        ),
-        "classic": BackendEntry(
-            ClassicBackendConfig,
-            ClassicEvidence,
-            pose_cells.Outcome,
-            lambda config, sensors, dtype: ClassicBackend(config, sensors.view_shape, dtype),
-        ),
+        "recall": BackendEntry(RecallBackendConfig, RecallEvidence, RecallOutcome, _of_views(RecallBackend)),
+        "classic": BackendEntry(ClassicBackendConfig, ClassicEvidence, Outcome, _of_views(ClassicBackend)),
         "localise": BackendEntry(
-            LocaliseBackendConfig,
-            LocaliseEvidence,
-            LocaliseOutcome,
-            lambda config, sensors, dtype: localise.build(config, sensors.view_shape, dtype),
+            LocaliseBackendConfig, LocaliseEvidence, LocaliseOutcome, _of_views(localise.build)
         ),
         "localise_grid": BackendEntry(
             GridLocaliseBackendConfig,
             GridLocaliseEvidence,
             GridLocaliseOutcome,
-            lambda config, sensors, dtype: localise_grid.build(config, sensors.feelers, dtype),
+            _of_feelers(localise_grid.build),
         ),
-        "grid": BackendEntry(
-            GridBackendConfig,
-            GridEvidence,
-            grid.GridOutcome,
-            lambda config, sensors, dtype: grid.build(config.grid, sensors.feelers, dtype),
-        ),
+        "grid": BackendEntry(GridBackendConfig, GridEvidence, grid.GridOutcome, _of_feelers(grid.build)),
     },
 )
 """Every method, by its value of `backend` in a configuration."""

@@ -21,7 +21,7 @@ from jax import lax
 
 from ratslam.classic import view_templates
 from ratslam.core.backend import Backend, Map, PoseCellProbe, enlarge
-from ratslam.core.estimates import Action, Estimate, PoseCellActivity, Scalar
+from ratslam.core.estimates import Estimate, PoseCellActivity, Scalar
 from ratslam.core.session import finite_values
 from ratslam.mapping.acceptance import Acceptance, AcceptByEvidence, AcceptByOdds
 from ratslam.mapping.appearance import (
@@ -40,17 +40,10 @@ from ratslam.network import pose_cells
 from ratslam.network.config import Network
 from ratslam.network.pose_cells import Belief
 from ratslam.places.map_views import MapViews, PieceTies
-from ratslam.recall import filter
+from ratslam.recall import filter, observation_model
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.filter import RecallResult
 from ratslam.recall.memory import CroppedRows, MapFeedback, Memory, MergedRows, init_memory
-from ratslam.recall.observation_model import (
-    ObservationLikelihood,
-    label_likelihood,
-    signed_likelihood,
-    touch_likelihood,
-    view_likelihood,
-)
 from ratslam.recall.signed_likelihood import stored_image
 from ratslam.recall.whisker_likelihood import live_pixels, pixel_layout, pixel_levels
 from tactile.base.se2 import compose, correct_heading
@@ -183,9 +176,8 @@ class RecallBackend(Backend):
     def merge_rows(self, state: RecallState, merged: MergedRows) -> RecallState:
         """The memory of the keyframes that remain; mass of merged ones goes to those they are merged with."""
         memory = state.memory.merge_rows(merged)
-        return state._replace(
-            memory=memory, belief=pose_cells.merge_rows(state.belief, merged.onto, merged.offset)
-        )
+        belief = pose_cells.merge_rows(state.belief, merged.onto, merged.offset)
+        return state._replace(memory=memory, belief=belief)
 
     def begin_piece(self, state: RecallState) -> RecallState:
         """All is novelty; the health is that of the start."""
@@ -229,8 +221,7 @@ class RecallBackend(Backend):
         return memory, self._anchored(memory, belief)
 
     def _anchored(self, memory: Memory, belief: Belief) -> Belief:
-        cells = filter.view_cells(self.recall, memory)
-        return pose_cells.anchor(self.network, belief, cells, belief.mass)
+        return pose_cells.anchor(self.network, belief, filter.view_cells(self.recall, memory), belief.mass)
 
     def kernel(
         self, state: RecallState, observation: Observation
@@ -267,15 +258,9 @@ class RecallBackend(Backend):
         outcome = jnp.where(has_room | ~seen, RecallOutcome.OK, RecallOutcome.FULL)
         outcome = jnp.where(clean, outcome, RecallOutcome.NOT_FINITE).astype(jnp.int32)
         sd, sd_heading = memory.pose_spread(self.recall, self.cell)
-        place = jnp.int32(-1)  # the map assigns places, because only it verifies closures
-        estimate = Estimate(
-            pose=memory.current_pose(),
-            spread=jnp.stack([sd, sd, sd_heading]),
-            place=place,
-            previous=place,
-            action=jnp.int32(Action.NONE),
-            lost=health < self.config.min_fit_share,
-        )
+        # The map assigns places, because only it verifies closures.
+        spread, lost = jnp.stack([sd, sd, sd_heading]), health < self.config.min_fit_share
+        estimate = Estimate.without_place(memory.current_pose(), spread, lost)
         evidence = RecallEvidence(
             **result._asdict(), certainty=jnp.sum(state.belief.activity), packet=packet, health=health,
             outcome=outcome,
@@ -404,13 +389,13 @@ class RecallBackend(Backend):
 
     def likelihood(
         self, config: RecallConfig, memory: Memory, view: Array, label: Array
-    ) -> tuple[Memory, ObservationLikelihood]:
+    ) -> tuple[Memory, observation_model.ObservationLikelihood]:
         """Likelihood of a view's features, or of an id, at every keyframe of a memory; and the memory with
         what the next view needs."""
         if self.labels:
-            return memory, label_likelihood(config, memory, label)
+            return memory, observation_model.label_likelihood(config, memory, label)
         if self.signed:
-            return signed_likelihood(config, memory, view)
+            return observation_model.signed_likelihood(config, memory, view)
         if self.pixels is not None:
-            return touch_likelihood(config, memory, view, self.pixels)
-        return memory, view_likelihood(config, self.cell, memory, view)
+            return observation_model.touch_likelihood(config, memory, view, self.pixels)
+        return memory, observation_model.view_likelihood(config, self.cell, memory, view)

@@ -59,9 +59,8 @@ def localising(config: RunConfig, saved: SavedMap, start: Start | None = None) -
     own = {name: getattr(config, name) for name in OWN}
     begin = {} if start is None else {"start": start}
     place = config.localise.model_copy(update={"map": saved.path.resolve(), **begin})
-    return saved.config.model_copy(
-        update=own | {"backend": LOCALISING[saved.config.backend], "localise": place}
-    )
+    changed = own | {"backend": LOCALISING[saved.config.backend], "localise": place}
+    return saved.config.model_copy(update=changed)
 
 
 def check_assignments(assignments: Sequence[str], saved: SavedMap) -> None:

@@ -97,8 +97,7 @@ def write_merged_results(folder: Path, made: Map, name: str, steps: Sequence[int
     """
     path, piece = made.trajectory(), made.pieces()
     write_map_results(folder, made, np.arange(len(path), dtype=float))
-    figure = draw_sessions(name, path, piece, steps)
-    write_atomically(folder / "map.png", figure.savefig)
+    write_atomically(folder / "map.png", draw_sessions(name, path, piece, steps).savefig)
 
 
 def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> None:

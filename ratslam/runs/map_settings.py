@@ -140,7 +140,6 @@ class Sensor(NamedTuple):
                 observations made of them.
         """
         info, touch = source.info, config.touch
-        templates = {name: getattr(config.templates, name) for name in NORMALISATION}
         geometry: dict[str, Any] = {}
         if touch.frontend is not None:
             kind, made = OTHER_TOUCH, {"touch.frontend": touch.frontend.model_dump(mode="json")}
@@ -151,20 +150,15 @@ class Sensor(NamedTuple):
             geometry = {f"touch.reports.{name}": reports[name] for name in ("mounts", "length")}
             kind, made = FIXED_WHISKERS, {"touch.reports.walls": reports["walls"]}
         elif source.whiskers:
-            head = touch.head.model_dump(mode="json")
-            geometry = {
-                f"touch.head.{name}": head[name] for name in head if name not in ("dead", "limit_deg")
-            }
+            head = touch.head.model_dump(mode="json", exclude={"dead", "limit_deg"})
+            geometry = {f"touch.head.{name}": value for name, value in head.items()}
             kind, made = WHISKER_HEAD, flat_settings(touch.image.model_dump(mode="json"), "touch.image.")
         else:
             kind, made = VIEWS, _views_of(config)[1]
-        transform = made | {f"templates.{name}": value for name, value in templates.items()}
-        transform = {
-            name: value
-            for name, value in transform.items()
-            if value is not None or name.startswith("recording.")
-        }
-        plain = json.loads(json.dumps([geometry, transform]))  # lists for tuples, as a file gives them back
+        given = made | {f"templates.{name}": getattr(config.templates, name) for name in NORMALISATION}
+        kept = [name for name in given if given[name] is not None or name.startswith("recording.")]
+        # Lists for tuples, as a file gives them back.
+        plain = json.loads(json.dumps([geometry, {name: given[name] for name in kept}]))
         unit, cell = UNITS[info.signed_views], config.pose_cells.cell_size
         return cls(kind, source.view_shape, source.whiskers, unit, cell, *plain)
 
@@ -200,14 +194,12 @@ class Sensor(NamedTuple):
         reason = self.disagreement(other)
         if settings := settings_of_map(self.differences(other)):
             found = f"made with other settings of the sensor: {reason}"
-            cure = (
-                f"`{assignments(settings)}` takes those of the map, and `doctor RECORDING --like {where}` too"
-            )
+            taken = f"`{assignments(settings)}` takes those of the map"
+            cure = f"{taken}, and `doctor RECORDING --like {where}` too"
             raise InputError(where, found, "a map of these settings", cure)
         if reason:
-            raise InputError(
-                where, f"made with another sensor: {reason}", f"a map of this sensor ({other.kind})"
-            )
+            found = f"made with another sensor: {reason}"
+            raise InputError(where, found, f"a map of this sensor ({other.kind})")
 
 
 def settings_of_map(found: Sequence[Difference]) -> dict[str, Any] | None:

@@ -59,16 +59,11 @@ def merge_maps(
 
     def join() -> None:
         for found in join_all(made, MapViews(backend, made.kept_keyframes()), tried, report):
-            joins.append(
-                {
-                    "maps": [sorted({owner[stretch] for stretch in piece}) for piece in found.stretches],
-                    "start": found.start.tolist(),
-                    "sd": found.sd.tolist(),
-                    "log_odds": list(found.log_odds),
-                    "needed": list(found.needed),
-                    "closures": found.closures,
-                }
-            )
+            measured = found._asdict()
+            pieces = measured.pop("stretches")
+            maps_of = [sorted({owner[stretch] for stretch in piece}) for piece in pieces]
+            numbers = {name: np.asarray(value).tolist() for name, value in measured.items()}
+            joins.append({"maps": maps_of} | numbers)
 
     join()
     for number, saved in enumerate(maps[1:], 1):
@@ -138,10 +133,7 @@ def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: Map
     made, first = session.map, maps[0]
     source = replace(first.source, name=" + ".join(dict.fromkeys(saved.source.name for saved in maps)))
     estimate = START._replace(pose=made.trajectory()[-1])
-
-    def write(file: Path) -> None:
-        write_map(file, session, first.config, source, estimate=estimate)
-
+    write = partial(write_map, session=session, config=first.config, source=source, estimate=estimate)
     if output.suffix == ".npz":
         make_new_file(output, write)
         return

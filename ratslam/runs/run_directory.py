@@ -9,21 +9,15 @@ from __future__ import annotations
 
 import fcntl
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from evaluation.artifacts import recorded_views
 from evaluation.artifacts.closure_table import CHANGES, ChangeRow, read_closure_table, write_changes
 from evaluation.artifacts.grid_files import read_grid, write_grid_truth, write_nav2
-from evaluation.artifacts.recorded_views import (
-    ClosureViews,
-    WhiskerViews,
-    write_closure_views,
-    write_whisker_views,
-)
 from evaluation.artifacts.run_reader import write_walls
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
 from evaluation.metrics.occupancy_score import score_grid
@@ -56,7 +50,7 @@ WhiskerView = tuple[np.ndarray, np.ndarray]
 """A whisker image: brightness [R, C, K] in 0..1, and bool [W], the whisker has a signal."""
 
 
-class RunDirectory:
+class RunDirectory(AbstractContextManager["RunDirectory"]):
     """A new run directory; a context manager that closes its text files.
 
     Its process holds a lock on steps.csv, which distinguishes a run from one that was killed.
@@ -82,9 +76,6 @@ class RunDirectory:
         heads = {"steps.csv": ",".join((*COLUMNS, *columns)), "online_error.csv": "t,error"}
         heads["timing.csv"] = "step,steps,seconds"
         self.append({name: head + "\n" for name, head in heads.items()})
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         for file in self._streams.values():
@@ -138,14 +129,14 @@ class RunDirectory:
         if not views or views[0][0].shape[:2] != head.shape or len(views[0][1]) != len(head.length):
             return
         columns = head.shape[1]
-        images = WhiskerViews(
+        images = recorded_views.WhiskerViews(
             view=np.array([view[..., 0] for view, _ in views]),
             alive=np.array([alive.reshape(head.shape) for _, alive in views]),
             azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
             length=head.length[::columns],
             tallest=config.image.tallest,
         )
-        self.file("views.npz", lambda path: write_whisker_views(path, images))
+        self.file("views.npz", lambda path: recorded_views.write_whisker_views(path, images))
 
     def save_closure_views(self, images: Sequence[np.ndarray | None]) -> None:
         """Writes recorded_views.npz: the images [R, C] of the steps that closures join; None: no view."""
@@ -153,8 +144,8 @@ class RunDirectory:
         seen = {step: image for step, image in enumerate(images) if image is not None}
         steps = [step for step in joined if step in seen]
         if steps:
-            views = ClosureViews(np.array(steps), np.stack([seen[step] for step in steps]))
-            self.file(recorded_views.NAME, lambda path: write_closure_views(path, views))
+            views = recorded_views.ClosureViews(np.array(steps), np.stack([seen[step] for step in steps]))
+            self.file(recorded_views.NAME, lambda path: recorded_views.write_closure_views(path, views))
 
     def save_grid_map(self) -> None:
         """Writes map.pgm and map.yaml if the map is a grid; if the arena and the robot's start in it are
@@ -176,18 +167,14 @@ class RunDirectory:
         """Writes changes.csv of a session that was localised in a map."""
         if not isinstance(map, Localiser):
             return
-        steps = map.visits().step
+        steps, same = map.visits().step, ("extent", "kind", "evidence", "alarms", "passes")
         rows = [
             ChangeRow(
                 x=float(change.position[0]),
                 y=float(change.position[1]),
-                extent=change.extent,
-                kind=change.kind,
-                evidence=change.evidence,
-                alarms=change.alarms,
-                passes=change.passes,
                 first_step=int(steps[change.keyframes[0]]),
                 last_step=int(steps[change.keyframes[-1]]),
+                **{name: getattr(change, name) for name in same},
             )
             for change in changes_of(map, config)
         ]

@@ -10,7 +10,7 @@ import hashlib
 import stat
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -279,9 +279,7 @@ def describe_readings(source: Source) -> SourceDescription:
     readings = source
     while isinstance(readings, TouchSource):
         readings = readings.source
-    return SourceDescription(
-        source.view_shape, source.whiskers, source.rate_hz, describe(readings).info, source.name
-    )
+    return replace(describe(source), info=readings.info)
 
 
 def _mismatch(saved: Mapping[str, np.ndarray], restored: Mapping[str, np.ndarray]) -> str:

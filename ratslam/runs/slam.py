@@ -19,6 +19,7 @@ from ratslam.runs.localise import localising
 from ratslam.runs.saved_map import describe_readings, is_map, read_map, write_map
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
+from robot.sources.in_memory import NO_ODOMETRY
 from robot.sources.source import Sample, Source, SourceDescription, SourceInfo
 from robot.touch_source import TouchSource, head_config_of, open_touch_source
 from tactile.base.bounded import malformed
@@ -74,9 +75,7 @@ class Slam:
         self.estimate = START
         self.cells: np.ndarray | None = None
         self._frontend = observed.start() if isinstance(observed, TouchSource) else None
-        self._blank = observation(
-            Odometry(0.0, 0.0, 0.0, 0.0), view_shape=observed.view_shape, whiskers=observed.whiskers
-        )
+        self._blank = observation(NO_ODOMETRY, view_shape=observed.view_shape, whiskers=observed.whiskers)
 
     @property
     def map(self) -> Map:
@@ -202,8 +201,7 @@ def _describe_whiskers(info: SourceInfo, touch: TouchConfig) -> SourceDescriptio
         return SourceDescription((1, count, 1), count, info=info)
     if info.head is None:
         cure = "give the source itself, or a SourceDescription with the view shape"
-        raise InputError(
-            "info", "a SourceInfo without whiskers", "one with `head` or `planar_whiskers`", cure
-        )
+        expected = "one with `head` or `planar_whiskers`"
+        raise InputError("info", "a SourceInfo without whiskers", expected, cure)
     head = ur10_head(head_config_of(info, touch.head))
     return SourceDescription(view_shape(touch.image, head), len(head.length), info=info)

@@ -277,8 +277,7 @@ class BackendTrial(Trial[BackendEntry]):
 
     @check(SESSION, "it is deterministic", "a result could not be reproduced")
     def is_deterministic(self) -> None:
-        session = Session(self.build())
-        found = list(session.replay(self.walk(SHORT)))
+        found = list(Session(self.build()).replay(self.walk(SHORT)))
         require_equal(self.steps[:SHORT], found, "two sessions of equal settings, seed and input")
 
     @check(SESSION, "it keeps no state of its own", "sessions of one backend would disturb each other")
@@ -292,14 +291,12 @@ class BackendTrial(Trial[BackendEntry]):
             beside += second.replay(others[k : k + CHUNK])
         require_equal(self.steps[:SHORT], found, "a session alone and beside another one")
         second.restart()
-        alone = list(second.replay(others))
-        require_equal(alone, beside, "a session alone and beside another one")
+        require_equal(list(second.replay(others)), beside, "a session alone and beside another one")
 
     @check(SESSION, "live and replay give the same bits", "a recording would not show what the robot did")
     def replays_as_live(self) -> None:
-        live = self.fresh()
-        found = [live.step(o) for o in self.walk(LIVE)]
-        require_equal(self.steps[:LIVE], found, "replay and live")
+        expected, live = self.steps[:LIVE], self.fresh()
+        require_equal(expected, [live.step(o) for o in self.walk(LIVE)], "replay and live")
 
     @check(SESSION, "any mixture of live and replay gives the same bits", "a session may change between them")
     def mixes_live_and_replay(self) -> None:
@@ -443,9 +440,8 @@ class BackendTrial(Trial[BackendEntry]):
 
     @check(SESSION, "doubt is a probability", "a doubted map is replaced by odometry")
     def gives_doubt(self) -> None:
-        made = self.map
         for name in ("doubt", "final_doubt"):
-            value = float(getattr(made, name)())
+            value = float(getattr(self.map, name)())
             require(np.isnan(value) or 0 <= value <= 1, f"{name} {value}", "a probability, or NaN")
 
     @check(SESSION, "the map's files and graph can be written", "a run ends with writing them")

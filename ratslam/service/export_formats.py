@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, uuid5
@@ -16,7 +17,7 @@ from uuid import NAMESPACE_URL, uuid5
 import numpy as np
 
 from evaluation.artifacts.grid_files import read_grid, write_nav2
-from evaluation.cells.analysis import CellScores, analyse_cells, write_scores
+from evaluation.cells.analysis import analyse_cells, write_scores
 from evaluation.cells.recording import NAME, CellRecording, read_recording
 from ratslam.classic.config import NetworkConfig, network_of
 from ratslam.core.compilation import prepare_precision
@@ -188,7 +189,7 @@ def export_run(
         case ".g2o" | ".json":
             what = "a pose graph" if suffix == ".g2o" else "a map of experiences"
             file = _file(directory / f"map{suffix}", what)
-            make_new_file(output, lambda path: shutil.copyfile(file, path))
+            make_new_file(output, partial(shutil.copyfile, file))
         case ".graphml":
             import networkx  # slow to import
 
@@ -206,7 +207,8 @@ def export_run(
             _, drawn, _ = read_run_cells(directory, config)
             make_new_file(output, lambda path: write_spikes(path, drawn))
         case ".csv":
-            scores = _score_cells(directory, config.peak_rate)
+            recording, network = _read_cells(directory)  # of all cells, if only sums were recorded
+            scores = analyse_cells(recording, config.peak_rate / settled_peak(network))
             make_new_file(output, lambda path: write_scores(path, scores))
 
 
@@ -254,20 +256,6 @@ def read_run_cells(directory: Path, config: SpikeConfig) -> tuple[CellRecording,
     spikes = draw_spikes(recording, settled_peak(network), config)
     documents = [network.model_dump_json().encode(), config.model_dump_json().encode()]
     return recording, spikes, digest_of([file.read_bytes(), *documents])
-
-
-def _score_cells(directory: Path, peak_rate: float) -> CellScores:
-    """Scores of the chosen cells of a run; if only sums were recorded, of all cells.
-
-    Args:
-        peak_rate: of a cell at the peak of a settled packet of the run's network, Hz.
-
-    Raises:
-        InputError: the run has no recorded cells, no true pose is known, the path has no area, or a file is
-            malformed.
-    """
-    recording, network = _read_cells(directory)
-    return analyse_cells(recording, peak_rate / settled_peak(network))
 
 
 def _read_cells(directory: Path) -> tuple[CellRecording, NetworkConfig]:

@@ -107,8 +107,7 @@ def agent_in_box(agent: Any, config: RatSimulationConfig | None = None) -> RatSi
             cure = "give a configuration and move the environment to the origin"
             found = f"an environment from ({left:g}, {bottom:g}) on"
             raise InputError("agent", found, "one from (0, 0)", cure)
-        box = BoxConfig(width=right, height=top)
-        config = RatSimulationConfig(box=box, rate_hz=round(1 / agent.dt, 6))
+        config = RatSimulationConfig(box=BoxConfig(width=right, height=top), rate_hz=round(1 / agent.dt, 6))
     return RatSimulation(config, path)
 
 

@@ -19,14 +19,7 @@ from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import load
 from ratslam.service.rig_fit import LEAST_TURNED, Quantity, Rig, WheelFit, fit_wheels
-from robot.recordings.real_whiskers import (
-    WHISKERS,
-    ReachConfig,
-    StageConfig,
-    find_touches,
-    read_reach,
-    read_stage_calibration,
-)
+from robot.recordings import real_whiskers
 from robot.sources.odometry import UNCORRECTED, OdometryCorrection
 from robot.sources.source import Sample, SourceInfo
 from robot.touch_source import observation_of
@@ -52,12 +45,12 @@ DRIFT_BLOCK = 0.5
 
 def read_signals_of_reach(source: PluginConfig) -> SignalRecord:
     """The signals of an arm that reaches through clutter; as a source it gives contacts only."""
-    config = read_settings(ReachConfig, source.settings, "source.settings")
-    signal = read_reach(config.file).signal
+    config = read_settings(real_whiskers.ReachConfig, source.settings, "source.settings")
+    signal = real_whiskers.read_reach(config.file).signal
     block = max(round(DRIFT_BLOCK * config.rate), 1)
-    contact = (find_touches(config, signal) == Touch.CONTACT).mean(axis=0)
+    contact = (real_whiskers.find_touches(config, signal) == Touch.CONTACT).mean(axis=0)
     free, apart = signal[: config.free_rows], block / config.rate
-    return SignalRecord(free, signal, block, apart, contact, WHISKERS, "counts")
+    return SignalRecord(free, signal, block, apart, contact, real_whiskers.WHISKERS, "counts")
 
 
 def _signals_of_cycles(samples: list[Sample]) -> SignalRecord:
@@ -203,14 +196,13 @@ def _from_revisits(config: RunConfig, samples: list[Sample], assumed: OdometryCo
     if config.recording is None:
         return Rig(unknown=("wheels: the record has no true poses",))
     scale = "length scale: no true poses, and a map closes its loops at any scale"
-    if not any(shows_place(sample.reading) for sample in samples):
-        reason = "no true poses, and no views that tell revisits"
-        return Rig(unknown=(scale, f"turn scale, heading bias: {reason}"))
-    found = fit_revisits(config, assumed)
-    if found is None:
-        reason = "no true poses, and the map closes no loops or is doubted"
-        return Rig(unknown=(scale, f"turn scale, heading bias: {reason}"))
-    return found._replace(unknown=(scale,))
+    reason = "no views that tell revisits"
+    if any(shows_place(sample.reading) for sample in samples):
+        found = fit_revisits(config, assumed)
+        if found is not None:
+            return found._replace(unknown=(scale,))
+        reason = "the map closes no loops or is doubted"
+    return Rig(unknown=(scale, f"turn scale, heading bias: no true poses, and {reason}"))
 
 
 def shows_place(reading: Any) -> bool:
@@ -277,8 +269,7 @@ def _fit_head(config: RunConfig, samples: list[Sample], info: SourceInfo) -> Rig
         f"head: {contacts} contacts; their protractions err by {1e3 * errors[0]:.1f} mrad, "
         f"{1e3 * errors[1]:.1f} with the head assumed; the radii are set in touch.head.rings"
     )
-    settings = {"touch": {"head": {"rings": rings}}}
-    return Rig(tuple(quantities), settings, (note, DELAY), tuple(unknown))
+    return Rig(tuple(quantities), {"touch": {"head": {"rings": rings}}}, (note, DELAY), tuple(unknown))
 
 
 FOLDS, BLOCK = 3, 10
@@ -291,8 +282,8 @@ def _fit_stage(source: PluginConfig) -> Rig:
     Raises:
         InputError: the record cannot be read.
     """
-    settings = read_settings(StageConfig, source.settings, "source.settings")
-    position, signal, base = read_stage_calibration(settings.file)
+    settings = read_settings(real_whiskers.StageConfig, source.settings, "source.settings")
+    position, signal, base = real_whiskers.read_stage_calibration(settings.file)
     # Root mean square errors over the channels of each row held out: of the map, and of the mean signal.
     errors = np.zeros((2, len(signal)))
     part = np.arange(len(signal)) // BLOCK % FOLDS

@@ -181,8 +181,7 @@ def _describe_bag(path: Path) -> _Found:
     elif shape is not None and kind in IMAGES:
         width, height = shape.size
         if height < SMALL.rows or width < SMALL.columns:
-            size = {"rows": min(height, SMALL.rows), "columns": min(width, SMALL.columns)}
-            recording["image"] = size
+            recording["image"] = {"rows": min(height, SMALL.rows), "columns": min(width, SMALL.columns)}
     config = {"recording": recording}
     return Diagnosis(what, tuple(rows), tuple(notes), tuple(faults), config=config), reach, fov
 
@@ -297,12 +296,11 @@ def _diagnose_registered(path: Path) -> Diagnosis | None:
     """A recording that a registered source reads, whose only setting without default is `file`; None if no
     source does."""
     for name in SOURCES.names():
-        settings = {"plugin": name, "settings": {"file": str(path.resolve())}}
+        sections = {"source": {"plugin": name, "settings": {"file": str(path.resolve())}}}
         try:
             fields = SOURCES.get(name, "source").config_class.model_fields
             if [key for key, field in fields.items() if field.is_required()] != ["file"]:
                 continue
-            sections = {"source": settings}
             with open_source(validate(parse(dump_data(sections), path.name), RunConfig)) as source:
                 facts, advice, _ = _summarise(source)
         except Exception:  # whatever a package does with a file that is not its own

@@ -46,14 +46,9 @@ KINDS = {
     "/view": "sensor_msgs/msg/Image",
 }
 """Topics and their types of messages."""
-GREY, GREEN, ORANGE, RED = (
-    (0.5, 0.5, 0.5, 0.6),
-    (0.1, 0.6, 0.2, 0.9),
-    (0.9, 0.5, 0.1, 0.4),
-    (0.8, 0.1, 0.1, 0.4),
-)
-VERDICTS = {"accepted": GREEN, "open": ORANGE, "undone": RED}
-"""Colours of the candidates for loop closures by verdict."""
+GREY, GREEN = (0.5, 0.5, 0.5, 0.6), (0.1, 0.6, 0.2, 0.9)
+VERDICTS = {"accepted": GREEN, "open": (0.9, 0.5, 0.1, 0.4), "undone": (0.8, 0.1, 0.1, 0.4)}
+"""Colours of the candidates for loop closures by verdict: green, orange, red."""
 THIN, THICK = 0.1, 0.3
 """Width of links, and diameter of experiences, as shares of the median distance of linked experiences."""
 LATCHED = ("/path/map", "/path/odometry", "/path/truth", "/map", "/markers")

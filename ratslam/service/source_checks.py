@@ -27,14 +27,7 @@ from ratslam.service.check_results import (
 )
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from robot.sources.source import SOURCES, ClosedSource, Sample, Source, SourceEntry, SourceInfo, rate_of
-from robot.touch_source import (
-    TOUCH,
-    ReadingProcessor,
-    TouchEntry,
-    head_config_of,
-    open_touch_source,
-    report_config_of,
-)
+from robot.touch_source import TOUCH, ReadingProcessor, TouchEntry, open_touch_source, touch_config_of
 from tactile.base.errors import InputError
 from tactile.base.plugins import NoSettings, PluginConfig
 from tactile.base.se2 import compose
@@ -113,12 +106,7 @@ class SourceTrial(Trial[SourceEntry]):
     def observing(self) -> Source:
         """The samples of the first pass, through the front end that they need."""
         stored = _StoredSource(self.source, self.reading.samples)
-        config = TouchConfig(frontend=self.frontend)
-        heads = {
-            "head": head_config_of(stored.info, config.head),
-            "reports": report_config_of(stored.info, config.reports),
-        }
-        return open_touch_source(stored, config.model_copy(update=heads))
+        return open_touch_source(stored, touch_config_of(stored.info, TouchConfig(frontend=self.frontend)))
 
     @cached_property
     def observations(self) -> list[Observation]:

@@ -16,11 +16,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Thread
-from typing import Any, Self
+from typing import Any
 
 from ratslam.runs.runner import MapReport, Observer, RunDescription, StepReport
 from robot.drivers.processes import put_last
@@ -36,7 +36,7 @@ GONE = 3
 """Exit code of the drawing process after it has said that the viewer is gone."""
 
 
-class Viewer:
+class Viewer(AbstractContextManager["Viewer"]):
     """An observer of a run and a context manager; its process starts at once, to be ready early.
 
     Args:
@@ -98,9 +98,6 @@ class Viewer:
         if pipe is not None:
             with suppress(OSError):
                 pipe.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Lets the process draw the rest, for a limited time, and ends it."""
@@ -210,8 +207,7 @@ def _start_viewer() -> None:
 
 
 def _answers(host: str, port: int) -> bool:
-    try:
+    with suppress(OSError):
         socket.create_connection((host.strip("[]"), port), timeout=1.0).close()
-    except OSError:
-        return False
-    return True
+        return True
+    return False

@@ -19,6 +19,7 @@ from ratslam.core.arrays import GrowableArray
 from ratslam.core.estimates import GridDrawing, PoseCellActivity
 from ratslam.runs.runner import MapReport, RunDescription, StepReport
 from ratslam.service.viewer_link import GONE
+from tactile.base.errors import tell
 from tactile.whisker_geometry import Head
 
 APPLICATION = "ratslam"
@@ -54,7 +55,7 @@ class Drawing:
     def __init__(self, recording: Any) -> None:
         import rerun
 
-        self._rr, self._recording = rerun, recording
+        self._rr, self._recording, self._log = rerun, recording, recording.log
         self._run = RunDescription("", "")
         self._start: float | None = None
         self._path = GrowableArray((3,), np.float64)  # of all steps: as last reported, then online
@@ -90,9 +91,6 @@ class Drawing:
         if len(self._online.rows):
             self._draw_map(map)
 
-    def _log(self, name: str, part: Any, static: bool = False) -> None:
-        self._recording.log(name, part, static=static)
-
     def _log_lines(self, name: str, strips: list[Any], colour: tuple[int, int, int], width: float) -> None:
         radius = self._rr.Radius.ui_points(width)
         self._log(f"world/{name}", self._rr.LineStrips3D(strips, colors=[colour], radii=radius))
@@ -119,8 +117,7 @@ class Drawing:
         observation = step.observation
         if observation.view_seen and observation.view.size:
             pixels = np.rint(255 * np.clip(observation.view, 0.0, 1.0)).astype(np.uint8)
-            shown = pixels if pixels.shape[2] == 3 else pixels[..., 0]
-            self._log("view", self._rr.Image(shown))
+            self._log("view", self._rr.Image(pixels if pixels.shape[2] == 3 else pixels[..., 0]))
         if self._run.head is not None:
             self._draw_whiskers(observation)
 
@@ -175,8 +172,7 @@ class Drawing:
             if before != sign:
                 self._verdicts[earlier, later] = sign
                 verdict = "dropped" if before == 1 else VERDICTS[sign][0]
-                text = f"step {later} with step {earlier}: {verdict}"
-                self._log("judgements", self._rr.TextLog(text))
+                self._log("judgements", self._rr.TextLog(f"step {later} with step {earlier}: {verdict}"))
         known = closures[(closures[:, :2] < len(self._path.rows)).all(axis=1)]
         for sign, (name, colour) in VERDICTS.items():
             self._draw_pairs(f"closures/{name}", known[known[:, 2] == sign, :2], colour)
@@ -295,11 +291,7 @@ def main(target: str, source: BinaryIO) -> int:
         if target.endswith(".rrd"):
             recording.disconnect()  # completes the file; with a viewer this may wait for ever
     except (RuntimeError, TimeoutError) as error:
-        print(
-            f"ratslam: warning: the view at {target} is gone ({error}); the run goes on without it",
-            file=sys.stderr,
-            flush=True,
-        )
+        tell(f"warning: the view at {target} is gone ({error}); the run goes on without it")
         return GONE
     return 0
 

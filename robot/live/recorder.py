@@ -7,9 +7,8 @@ system within 0.2 s, measured on the passed times, so a killed process loses no 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from threading import Lock
-from typing import Self
 
 import numpy as np
 
@@ -23,7 +22,7 @@ BLOCK_TIME = 0.15
 """Time for which frames and states are collected into a block, s."""
 
 
-class LiveRecorder:
+class LiveRecorder(AbstractContextManager["LiveRecorder"]):
     """Writes a session to a new recording; a context manager.
 
     Any thread may add data; a call waits for the disk. When the disk is full, `fault` is set, later data are
@@ -139,9 +138,6 @@ class LiveRecorder:
                 yield self.fault is None
             except RecordingWriteError as error:
                 self.fault = Fault(SessionOutcome.DISK_FULL, str(error), time)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

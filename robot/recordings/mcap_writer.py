@@ -6,11 +6,11 @@ Chunks are zstd-compressed, have checksums, and reach the operating system as a 
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from itertools import chain
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -35,7 +35,7 @@ class RecordingWriteError(InputError):
         super().__init__(str(path), f"cannot be written any further ({error.strerror or error})", "", cure)
 
 
-class Recorder:
+class Recorder(AbstractContextManager["Recorder"]):
     """Writes a new file; a context manager.
 
     Args:
@@ -151,9 +151,6 @@ class Recorder:
                 raise RecordingWriteError(self.path, error) from error
         finally:
             self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

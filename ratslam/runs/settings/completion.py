@@ -8,7 +8,7 @@ from ratslam.runs.settings.packaged import PRESETS, PresetName
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.odometry import odometry_extent
 from robot.sources.source import Source
-from robot.touch_source import head_config_of, report_config_of
+from robot.touch_source import touch_config_of
 
 EXTENT_FACTOR, EXTENT_MARGIN = 1.15, 0.6
 """On each side of the start, the grid map covers the extent of the odometry times the factor, for its drift,
@@ -30,11 +30,7 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
         InputError: the head of the source and the settings in `touch.head` do not fit.
     """
     info = source.info
-    touch = {
-        "head": head_config_of(info, config.touch.head),
-        "reports": report_config_of(info, config.touch.reports),
-    }
-    config = config.model_copy(update={"touch": config.touch.model_copy(update=touch)})
+    config = config.model_copy(update={"touch": touch_config_of(info, config.touch)})
     if info.cell_size is not None:
         config = _fill(config, {"pose_cells": {"cell_size": info.cell_size}})
     if info.labels_only:

@@ -6,20 +6,14 @@ import copy
 
 from ratslam.runs.settings.yaml_document import Document, KeyPath
 
+TO_ATTRACTOR = (
+    "excite_width", "excite_sigma", "inhibit_width", "inhibit_sigma", "global_inhibition", "settle_steps",
+    "engine",
+)  # fmt: skip
+LEFT_RECALL = ("mode_decay", "miss_weight", "reach", "reach_heading", "modes", "energy")
 MOVED: dict[str, str | None] = {
-    "pose_cells.excite_width": "attractor.excite_width",
-    "pose_cells.excite_sigma": "attractor.excite_sigma",
-    "pose_cells.inhibit_width": "attractor.inhibit_width",
-    "pose_cells.inhibit_sigma": "attractor.inhibit_sigma",
-    "pose_cells.global_inhibition": "attractor.global_inhibition",
-    "pose_cells.settle_steps": "attractor.settle_steps",
-    "pose_cells.engine": "attractor.engine",
-    "recall.mode_decay": None,
-    "recall.miss_weight": None,
-    "recall.reach": None,
-    "recall.reach_heading": None,
-    "recall.modes": None,
-    "recall.energy": None,
+    **{f"pose_cells.{name}": f"attractor.{name}" for name in TO_ATTRACTOR},
+    **dict.fromkeys(f"recall.{name}" for name in LEFT_RECALL),
 }
 """Old dotted path of a setting to the new one; None: the pose cells have no such setting."""
 

@@ -112,20 +112,14 @@ class RunConfig(LocaliseBackendConfig, ClassicBackendConfig, GridBackendConfig, 
 
     def with_absolute_paths(self, folder: Path) -> RunConfig:
         """The configuration with relative paths taken from `folder`, independent of the working folder."""
-        relations = self.score.relations
-        parts = {
-            name: part and part.resolved(folder)
-            for name in ("recording", "simulation", "create_simulation", "rat_simulation", "live")
-            for part in [getattr(self, name)]
-        }
+        found = self.resolved(folder)  # all but the settings of plugins
+        parts = {name: getattr(found, name) for name in SOURCE_SECTIONS}
         parts["source"] = self.source and _resolved_plugin(self.source, SOURCES, folder)
-        frontend = self.touch.frontend
-        frontend = frontend and _resolved_plugin(frontend, TOUCH, folder)
-        touch = {"reports": self.touch.reports.resolved(folder), "frontend": frontend}
+        frontend = self.touch.frontend and _resolved_plugin(self.touch.frontend, TOUCH, folder)
+        touch = {"reports": found.touch.reports, "frontend": frontend}
         parts["touch"] = self.touch.model_copy(update=touch)
-        file = self.localise.map
-        parts["localise"] = self.localise.model_copy(update={"map": file and folder / file})
-        parts["score"] = self.score.model_copy(update={"relations": relations and folder / relations})
+        parts["localise"] = self.localise.model_copy(update={"map": found.localise.map})
+        parts["score"] = self.score.model_copy(update={"relations": found.score.relations})
         return self.model_copy(update=parts)
 
 
@@ -209,10 +203,8 @@ def _check_plugins(document: Document, config: RunConfig) -> None:
             elif document.value(settings):
                 found = f"settings of a registered {registry.noun}, but '{plugin}' is one of ours"
                 raise InputError(document.at_key(settings), found)
-        except InputErrors as several:
-            errors += several.errors
         except InputError as error:
-            errors.append(error)
+            errors += getattr(error, "errors", [error])  # of several together, or itself
     if errors:
         raise InputErrors(errors)
 

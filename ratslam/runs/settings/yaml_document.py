@@ -56,9 +56,8 @@ class Document:
 
     def at_value(self, path: KeyPath) -> str:
         """`file:line:column: a.b` of a value; of the nearest section above if it is missing."""
-        return (
-            _label(self.places[path].value, self.above + path) if path in self.places else self.at_key(path)
-        )
+        place = self.places.get(path)
+        return _label(place.value, self.above + path) if place else self.at_key(path)
 
     def value(self, path: KeyPath) -> Any:
         """The value at a path; None if there is none."""
@@ -157,10 +156,8 @@ class Reader:
             raise self._syntax(error) from None
         except InputError:
             raise
-        except (
-            ValueError,
-            OverflowError,
-        ):  # PyYAML raises these for escapes like "\UFFFFFFFF" and `%YAML 1.111…`
+        except (ValueError, OverflowError):
+            # PyYAML raises these for escapes like "\UFFFFFFFF" and `%YAML 1.111…`.
             raise self._error(self._root, "not YAML: an escape out of range after this") from None
         if self._errors:
             raise InputErrors(self._errors)
@@ -300,14 +297,8 @@ class Dumper(yaml.SafeDumper):
     def resolve(self, kind: type, value: Any, implicit: Any) -> Any:
         """The tag that a reader gives a node: that of YAML 1.1, or a number if our reader finds one."""
         tag = super().resolve(kind, value, implicit)
-        if (
-            kind is yaml.ScalarNode
-            and implicit[0]
-            and tag == _TEXT
-            and not isinstance(_read_word(value), str)
-        ):
-            return "tag:yaml.org,2002:float"
-        return tag
+        plain = kind is yaml.ScalarNode and implicit[0] and tag == _TEXT
+        return "tag:yaml.org,2002:float" if plain and not isinstance(_read_word(value), str) else tag
 
     def ignore_aliases(self, data: Any) -> bool:
         """Always true: anchors are refused on reading, so a shared list is written twice."""

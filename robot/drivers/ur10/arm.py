@@ -127,7 +127,7 @@ PendingMove = tuple[int, Move, float]
 """A move in progress: number of the command, the move as planned, and its deadline, s, host's clock."""
 
 
-class Arm:
+class Arm(contextlib.AbstractContextManager["Arm"]):
     """One arm. One thread calls its methods; a supervising thread updates its state.
 
     Attributes:
@@ -153,9 +153,6 @@ class Arm:
         self._late = 0.0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="arm", daemon=True)
-
-    def __enter__(self) -> Arm:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

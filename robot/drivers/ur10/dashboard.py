@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import socket
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from typing import NamedTuple
 
 PORT = 29999
@@ -34,7 +34,7 @@ class ControllerStatus(NamedTuple):
     remote: bool | None
 
 
-class Dashboard:
+class Dashboard(AbstractContextManager["Dashboard"]):
     """A connection to the dashboard server; a context manager."""
 
     def __init__(self, host: str, timeout: float = 1.0) -> None:
@@ -46,9 +46,6 @@ class Dashboard:
             self._line()  # the greeting
         except OSError as error:
             raise DashboardSilent(f"no dashboard server answers at {host}:{PORT} ({error})") from None
-
-    def __enter__(self) -> Dashboard:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -15,7 +15,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -115,7 +115,7 @@ class ToolPose(NamedTuple):
     robot_time: float
 
 
-class PoseListener:
+class PoseListener(contextlib.AbstractContextManager["PoseListener"]):
     """Reads poses in a separate thread, and reconnects when the connection is lost.
 
     Args:
@@ -140,9 +140,6 @@ class PoseListener:
         """Ends the thread."""
         self._closing.set()
         self._thread.join(self._patience + 1.0)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

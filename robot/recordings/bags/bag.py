@@ -11,13 +11,13 @@ import io
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from copy import copy
 from functools import cached_property
 from heapq import heappop, heappush, merge
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO, Any, Literal, NamedTuple, Self, cast
+from typing import IO, Any, Literal, NamedTuple, cast
 
 import numpy as np
 import zstandard
@@ -91,7 +91,7 @@ class Topic(NamedTuple):
     total: int
 
 
-class Bag:
+class Bag(AbstractContextManager["Bag"]):
     """An open bag, a context manager.
 
     Args:
@@ -299,9 +299,6 @@ class Bag:
         known = ("*", self._store.generate_msgdef(topic.kind)[1]) if self._first else ()
         if self._first and any(each.digest not in known for each in connections):
             raise InputError(where, f"another definition of {topic.kind}", "that of ROS Noetic")
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self._stack.close()
