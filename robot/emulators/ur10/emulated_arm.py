@@ -92,15 +92,17 @@ class _LinearMotion(NamedTuple):
         time = self.time + dt
         done, rate = self.profile.at(time)
         length = self.profile.length or 1.0
-        x, y, z, rx, ry, rz = (done / length * number for number in self.way)
-        start = self.start
-        tcp = (start[0] + x, start[1] + y, start[2] + z, *rotate_by(start, (rx, ry, rz)))
         rest = None if time >= self.profile.duration else self._replace(time=time)
-        return tcp, _scale(self.way, rate / length), rest
+        return _move(self.start, _scale(self.way, done / length)), _scale(self.way, rate / length), rest
 
 
 def _scale(vector: Iterable[float], scale: float) -> Vector6:
     return vector6(x * scale for x in vector)
+
+
+def _move(tcp: Vector6, way: Vector6) -> Vector6:
+    """A tool pose after a translation and a rotation in the base frame."""
+    return (tcp[0] + way[0], tcp[1] + way[1], tcp[2] + way[2], *rotate_by(tcp, way[3:]))
 
 
 class MoveL(NamedTuple):
@@ -125,14 +127,8 @@ class StopL(NamedTuple):
         for now, most in ((state.speed[:3], step), (state.speed[3:], step * turn_ratio)):
             length = math.hypot(*now)
             slowed += [0.0 if length <= most else v - v * most / length for v in now]
-        x, y, z, rx, ry, rz = speed = vector6(slowed)
-        tcp = (
-            state.tcp[0] + x * dt,
-            state.tcp[1] + y * dt,
-            state.tcp[2] + z * dt,
-            *rotate_by(state.tcp, (rx * dt, ry * dt, rz * dt)),
-        )
-        return tcp, speed, self if any(speed) else None
+        speed = vector6(slowed)
+        return _move(state.tcp, _scale(speed, dt)), speed, self if any(speed) else None
 
 
 MoveOrder = MoveL | StopL
@@ -194,8 +190,7 @@ class EmulatedArm:
     def place(self, tcp: Vector6) -> None:
         """Sets the tool pose [6] (m, rotation vector rad) at once. Raises `Unreachable`."""
         self.state = _MotionState(tcp, ZERO, self.solve(tcp), ZERO)
-        self._motion, self._order = None, None
-        self._queue.clear()
+        self.order(())
         self._update_force()
 
     def set_tool(self, tool: Vector6) -> None:
@@ -232,8 +227,7 @@ class EmulatedArm:
             if self._motion is not None:
                 self._advance(dt)
         except Unreachable:
-            self._motion, self._order = None, None
-            self._queue.clear()
+            self.order(())
             self._rest()
             raise
         self._update_force()
