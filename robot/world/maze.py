@@ -245,10 +245,8 @@ def parse_maze(text: str, path: Path) -> Maze:
     Raises:
         InputError: the text has an unexpected character, or lacks an outer wall.
     """
-    lines = [line.rstrip() for line in text.splitlines()]
+    lines = [line.rstrip() for line in text.rstrip().splitlines()]
     skipped = next((number for number, line in enumerate(lines) if line), 0)
-    while lines and not lines[-1]:
-        lines.pop()
     lines = lines[skipped:]
     rows, width = len(lines) // 2, max((len(line) for line in lines), default=0)
     columns = (width - 1) // 4

@@ -264,9 +264,7 @@ class EmulatedArm:
             tcp, speed, self._motion = motion.advance(dt * scale)
         after = self.solve(tcp)
         rate = _scale((new - old for new, old in zip(after, joints, strict=True)), 1 / (dt * scale))
-        if scale != 1.0:
-            speed, rate = _scale(speed, scale), _scale(rate, scale)
-        self.state = _MotionState(tcp, speed, after, rate)
+        self.state = _MotionState(tcp, _scale(speed, scale), after, _scale(rate, scale))
         if self._motion is None:
             self._order = None
             self._rest()
