@@ -149,13 +149,9 @@ def _keeps_one_outline(blob: np.ndarray, i: int, j: int) -> bool:
     padded = np.pad(blob, 1)
     ring = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
     around = [bool(padded[i + 1 + di, j + 1 + dj]) for di, dj in ring]
-    sides = around[::2]
     changes = sum(a != b for a, b in zip(around, around[1:] + around[:1], strict=True))
-    return (
-        any(sides)
-        and changes == 2
-        and not any(around[k] and not (around[k - 1] or around[(k + 1) % 8]) for k in (1, 3, 5, 7))
-    )
+    alone = any(around[k] and not (around[k - 1] or around[(k + 1) % 8]) for k in (1, 3, 5, 7))
+    return any(around[::2]) and changes == 2 and not alone
 
 
 def _trace_outline(blob: np.ndarray, random: np.random.Generator) -> list[Cell]:

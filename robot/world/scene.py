@@ -164,9 +164,8 @@ class MazeConfig(Settings):
     @model_validator(mode="after")
     def _one_height(self) -> MazeConfig:
         if (self.added or self.removed) and len(self.heights) > 1:
-            raise ValueError(
-                "added and removed walls need one height; several are drawn in order of the walls"
-            )
+            cause = "several are drawn in order of the walls"
+            raise ValueError(f"added and removed walls need one height; {cause}")
         return self
 
 

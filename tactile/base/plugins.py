@@ -52,9 +52,8 @@ class Registry(Generic[Entry]):
             TypeError: `entry` is of another type.
         """
         if not isinstance(entry, self._kind):
-            raise TypeError(
-                f"a {self.noun} is registered as a {self._kind.__name__}, not a {type(entry).__name__}"
-            )
+            wanted, given = self._kind.__name__, type(entry).__name__
+            raise TypeError(f"a {self.noun} is registered as a {wanted}, not a {given}")
         if name in self.builtin or self._registered.get(name, entry) is not entry:
             raise ValueError(f"the {self.noun} '{name}' is registered already")
         self._registered[name] = entry
@@ -95,10 +94,8 @@ class Registry(Generic[Entry]):
         try:
             entry = points[0].load()
         except Exception as error:  # whatever a package does while it is imported
-            cause = f"{type(error).__name__}: {error}"
-            raise InputError(
-                where, f"{found} cannot be loaded: {cause}", cure="repair or remove it"
-            ) from error
+            found += f" cannot be loaded: {type(error).__name__}: {error}"
+            raise InputError(where, found, cure="repair or remove it") from error
         if not isinstance(entry, self._kind):
             raise InputError(where, f"{found} is of type {type(entry).__name__}", self._kind.__name__)
         return entry

@@ -322,10 +322,8 @@ class CreateWhiskers(SensorArray):
         strain = base_strains(self.config.whiskers, self._fan, bent) + shake[:, None]
         strain += self.config.whiskers.noise * self._random.standard_normal(strain.shape)
         strain = np.where(self._fan.alive[:, None], strain, 0.0)
-        still = np.zeros(self._samples, bool)
-        return Block(
-            np.zeros(strain.shape[:2]), strain / self.config.strain_per_radian, still, fed_back=False
-        )
+        angle, begins = np.zeros(strain.shape[:2]), np.zeros(self._samples, bool)
+        return Block(angle, strain / self.config.strain_per_radian, begins, fed_back=False)
 
     def skip_block(self) -> None:
         self._pose = self._robot.pose

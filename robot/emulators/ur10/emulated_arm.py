@@ -144,9 +144,8 @@ def parse_moves(text: str) -> list[MoveL]:
     for match in filter(None, map(_MOVE.match, text.splitlines())):
         with contextlib.suppress(ValueError):  # not numbers: the line is ignored
             goal = vector6(map(float, match["pose"].split(",")))
-            limits = {"a": 1.2, "v": 0.25} | {
-                name: float(value) for name, value in _LIMIT.findall(match["limits"])
-            }
+            given = {name: float(value) for name, value in _LIMIT.findall(match["limits"])}
+            limits = {"a": 1.2, "v": 0.25} | given
             moves.append(MoveL(goal, limits["v"], limits["a"]))
     return moves
 

@@ -7,6 +7,7 @@ behaviour, wheels, strain), so that changing one part leaves the others unchange
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -160,9 +161,8 @@ def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.ran
     while step.moment == StepEnd.FREE and step.pose[0] < 2 * APPROACH + whiskers.length:
         step = robot.step(step, CreateState.FWD1, WheelCommand(behaviour.fast, 0.0, behaviour.step))
     if step.moment != StepEnd.HIT1:
-        found = (
-            f"no contact at a strain of {behaviour.contact:g} with a wall at {np.degrees(angle):.0f} degrees"
-        )
+        wall_text = f"a wall at {np.degrees(angle):.0f} degrees"
+        found = f"no contact at a strain of {behaviour.contact:g} with {wall_text}"
         expected = "a lower strain, or whiskers that reach beyond the body"
         raise InputError("create_simulation.behaviour.contact", found, expected)
     patient = behaviour.model_copy(update={"safety": np.inf, "least": RECORD_TIME})
@@ -188,14 +188,9 @@ def train_strain_templates(config: CreateSimulationConfig) -> StrainTemplates:
     """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G)."""
     training = TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
     random = stream(config.seed, "templates")
-    return train_templates(
-        (
-            TrainingDrive.of_report(angle, repeat, drive_into_wall(config, angle, random))
-            for angle in training.angles.tolist()
-            for repeat in range(training.repeats)
-        ),
-        training,
-    )
+    each = product(training.angles.tolist(), range(training.repeats))
+    drives = (TrainingDrive.of_report(at, k, drive_into_wall(config, at, random)) for at, k in each)
+    return train_templates(drives, training)
 
 
 MIN_DURATION = 1e-6

@@ -248,10 +248,8 @@ class HeadSimulation(SimulatedSource):
             change = int(config.later_maze * count)
             other = other_surroundings(self.scene, config.maze, head, seed)
             self._parts = [(self.scene.surroundings, slice(change)), (other, slice(change, None))]
-        mechanics = config.mechanics
-        self._baseline = make_baseline(
-            mechanics.baseline, mechanics.noise, config.stream.rate, self.whiskers, seed
-        )
+        mechanics, rate = config.mechanics, config.stream.rate
+        self._baseline = make_baseline(mechanics.baseline, mechanics.noise, rate, self.whiskers, seed)
         self.calibration, self.features = None, None
         if self.tier == "kinematic":
             parts = []
@@ -276,10 +274,8 @@ class HeadSimulation(SimulatedSource):
             cell_size=POSE_CELL_SIZE,
             head=head_config,
             calibration=self.calibration,
-            maze=maze_info(self.scene.maze, config.maze, config.seed),
-            simulation=SimulationInfo(
-                sha256=self.digest, seed=config.seed, tier=self.tier, why=self.tier_reason
-            ),
+            maze=maze_info(self.scene.maze, config.maze, seed),
+            simulation=SimulationInfo(sha256=self.digest, seed=seed, tier=self.tier, why=self.tier_reason),
             provenance={"simulation": plain},
         )
 
@@ -290,8 +286,6 @@ class HeadSimulation(SimulatedSource):
         assert self.calibration is not None
         random, baseline = stream(self.config.seed, "sensor"), deepcopy(self._baseline)
         model, threshold = RAW_TIERS[self.tier], self.calibration.threshold[:, 1]
-        for surroundings, rows in self._parts:
+        for walls, rows in self._parts:
             path, start = self.scene.path, self.start[rows]
-            yield from simulate_cycles(
-                model, self._setup, surroundings, path, start, random, threshold, baseline
-            )
+            yield from simulate_cycles(model, self._setup, walls, path, start, random, threshold, baseline)
