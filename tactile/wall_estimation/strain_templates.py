@@ -200,10 +200,8 @@ def train_templates(
         few = ", ".join(f"{count[k]} at {np.degrees(angles[k]):.3g} degrees" for k in less)
         where = f"{training.repeats} at each angle"
         raise InputError(TEMPLATES, f"too few drives: {few}", where, "add drives")
-    sets = []
-    for at in near.T:
-        chosen = [drives[k].strain[: training.samples] for k in np.flatnonzero(at)]
-        sets.append(np.stack([filter_strain(training, strain) for strain in chosen]))
+    filtered = [filter_strain(training, drive.strain[: training.samples]) for drive in drives]
+    sets = [np.stack([filtered[k] for k in np.flatnonzero(at)]) for at in near.T]
     mean = np.stack([one.mean(axis=0) for one in sets])
     # Most channels have no contact most of the time, so the median measures noise.
     parts = [((one - one.mean(axis=0)) ** 2).swapaxes(1, 2).reshape(-1, training.samples, 2) for one in sets]
