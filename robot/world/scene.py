@@ -254,8 +254,7 @@ def make_scene(
         when = np.linspace(0.25, 0.95, kidnaps.count) * duration
         path, jumps = add_kidnaps(path, when.tolist(), kidnaps.ahead)
     boxes = wall_boxes(maze, stream(maze_seed(maze_config, seed), "maze.heights"), maze_config.heights)
-    surroundings = _check_surroundings(boxes, head, path)
-    return Scene(maze, loop, path, duration, jumps, surroundings)
+    return Scene(maze, loop, path, duration, jumps, _check_surroundings(boxes, head, path))
 
 
 def other_surroundings(scene: Scene, config: MazeConfig, head: Head, seed: int) -> Surroundings:

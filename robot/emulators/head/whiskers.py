@@ -229,18 +229,14 @@ class _ServoDrives:
     def receive(self, command: usb.Command, time: float) -> None:
         """Stores a command received at a time, s (the clock of `begin`)."""
         self._command_time = time
-        if command.kind == usb.CommandKind.DRIVE:
+        kind, whisk, fits = command.kind, self.whisk, len(command.numbers) == len(self._centre)
+        if kind == usb.CommandKind.DRIVE:
             self._next = self._make_whisk(command) or self._next
-        elif command.kind == usb.CommandKind.CENTRE and len(command.numbers) == len(self._centre):
+        elif kind == usb.CommandKind.CENTRE and fits:
             self._centre = command.numbers * usb.ANGLE
-        elif (
-            command.kind == usb.CommandKind.AMPLITUDES
-            and self.whisk is not None
-            and len(command.numbers) == len(self._centre)
-            and not self.whisk.feedback
-        ):
-            most = self.head.limit - self.whisk.offset
-            self.whisk = self.whisk._replace(amplitude=np.clip(command.numbers * usb.ANGLE, 0.0, most))
+        elif kind == usb.CommandKind.AMPLITUDES and fits and whisk is not None and not whisk.feedback:
+            most = self.head.limit - whisk.offset
+            self.whisk = whisk._replace(amplitude=np.clip(command.numbers * usb.ANGLE, 0.0, most))
 
     def stop(self) -> None:
         """Retracts and discards pending commands."""

@@ -118,13 +118,11 @@ class StopL(NamedTuple):
 
     acceleration: float
 
-    def advance(
-        self, state: _MotionState, dt: float, turn_ratio: float
-    ) -> tuple[Vector6, Vector6, StopL | None]:
-        """Slows translation and rotation down; `turn_ratio` (rad/m) relates their decelerations."""
+    def advance(self, state: _MotionState, dt: float, ratio: float) -> tuple[Vector6, Vector6, StopL | None]:
+        """Slows translation and rotation down; `ratio` (rad/m) relates their decelerations."""
         slowed: list[float] = []
         step = self.acceleration * dt
-        for now, most in ((state.speed[:3], step), (state.speed[3:], step * turn_ratio)):
+        for now, most in ((state.speed[:3], step), (state.speed[3:], step * ratio)):
             length = math.hypot(*now)
             slowed += [0.0 if length <= most else v - v * most / length for v in now]
         speed = vector6(slowed)

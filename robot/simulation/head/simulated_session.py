@@ -26,6 +26,7 @@ from robot.simulation.head.beam import Beam, StreamConfig, make_beam
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns, simulate_kinematic
 from robot.simulation.head.odometry_errors import OdometryConfig, simulate_odometry
 from robot.simulation.head.whisk_stream import (
+    TrueSamples,
     WallSweep,
     simulate_cycles,
     simulate_free_cycles,
@@ -63,9 +64,7 @@ WALL_STIFFNESS = 300.0
 """Ratio of wall stiffness to whisker stiffness."""
 
 
-def simulate_dynamic(
-    setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulate_dynamic(setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray) -> TrueSamples:
     """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.MechanicsModel`."""
     head, config, mechanics, whisking = setup
     model = make_beam(config.beam.shaft)

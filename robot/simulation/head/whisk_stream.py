@@ -45,9 +45,11 @@ class WallSweep(NamedTuple):
     noise: np.ndarray
 
 
-MechanicsModel = Callable[[HeadSetup, WallSweep, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""A model of the mechanics: true angle, x and y of every sample, [T, N, W] rad, of a sweep, with contact
-thresholds [W] of y, rad. Its whisking law reads y with noise."""
+TrueSamples = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""True angle, x and y of every sample, [T, N, W] rad."""
+MechanicsModel = Callable[[HeadSetup, WallSweep, np.ndarray], TrueSamples]
+"""A model of the mechanics: the samples of a sweep, with contact thresholds [W] of y, rad. Its whisking law
+reads y with noise."""
 
 
 def simulate_cycles(
@@ -120,7 +122,7 @@ def draw_noise(
 def sensor_readings(
     config: StreamConfig,
     head: Head,
-    truth: tuple[np.ndarray, np.ndarray, np.ndarray],
+    truth: TrueSamples,
     noise: np.ndarray,
     baseline: Baseline | None,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -216,7 +218,7 @@ def advance_balance(
     law: WhiskingLaw,
     sweep: WallSweep,
     balance: WhiskerBalance,
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], WhiskerBalance]:
+) -> tuple[TrueSamples, WhiskerBalance]:
     """The samples of a sweep, which may be any part of a cycle, continuing from a state.
 
     Returns:
@@ -248,9 +250,7 @@ def advance_balance(
     return (angle, hard * aside, hard * bent), after
 
 
-def simulate_quasistatic(
-    setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulate_quasistatic(setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray) -> TrueSamples:
     """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.MechanicsModel`."""
     head, config, mechanics, whisking = setup
 
