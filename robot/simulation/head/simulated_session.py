@@ -23,7 +23,7 @@ from scipy.linalg import expm
 
 from robot.simulation.head.baseline import make_baseline
 from robot.simulation.head.beam import Beam, StreamConfig, make_beam
-from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns, simulate_kinematic
+from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, simulate_kinematic
 from robot.simulation.head.odometry_errors import OdometryConfig, simulate_odometry
 from robot.simulation.head.whisk_stream import (
     TrueSamples,
@@ -255,9 +255,9 @@ class HeadSimulation(SimulatedSource):
             for surroundings, cycles in self._parts:
                 random = stream(seed, "sensor")  # noise of the whole session, independent of the maze
                 columns = simulate_kinematic(self._setup, surroundings, self.scene.path, self.start, random)
-                parts.append([column[cycles] for column in columns])
+                parts.append([column[cycles] for column in columns[2:]])
             features = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-            self.features = WhiskColumns(*features)
+            self.features = Whisk(NO_ODOMETRY, head.alive, *features)
         else:  # free whisking before the session
             whisks = int(np.ceil(config.calibration.min_duration * whisking.rate))
             random, model = stream(seed, "calibration"), RAW_TIERS[self.tier]
@@ -280,7 +280,8 @@ class HeadSimulation(SimulatedSource):
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
         if self.features is not None:
-            yield from (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in zip(*self.features, strict=True))
+            rows = zip(*self.features[2:], strict=True)
+            yield from (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in rows)
             return
         assert self.calibration is not None
         random, baseline = stream(self.config.seed, "sensor"), deepcopy(self._baseline)

@@ -120,11 +120,7 @@ def draw_noise(
 
 
 def sensor_readings(
-    config: StreamConfig,
-    head: Head,
-    truth: TrueSamples,
-    noise: np.ndarray,
-    baseline: Baseline | None,
+    config: StreamConfig, head: Head, truth: TrueSamples, noise: np.ndarray, baseline: Baseline | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sensor readings for true values of a model: angles [N, T, W] and deflections [N, T, W, 2], rad.
 
