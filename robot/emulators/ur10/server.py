@@ -248,10 +248,8 @@ class DashboardSession(_LineSession):
             "polyscopeversion": "URSoftware {}.{}.{}.0 (emulated)".format(*controller.config.version),
         }
         if controller.config.version >= (5, 6):
-            answers |= {
-                "is in remote control": str(controller.remote).lower(),
-                "get serial number": "20163000000",
-            }
+            answers["is in remote control"] = str(controller.remote).lower()
+            answers["get serial number"] = "20163000000"
         return answers.get(name, f"could not understand: '{command}'")
 
 
