@@ -261,13 +261,11 @@ class _ServoDrives:
                 return balance
             self._from, self.sample = None, 0
             balance = whiskers_at_rest(*balance.before.shape)
-        ended = self.whisk is not None and self.sample >= self.whisk.samples
-        if (self.whisk is None and self._next is not None) or ended:
-            if self._next is not None:
-                self.whisk, self._next = self._next, None
-            assert self.whisk is not None
-            common = np.full(len(self._centre), np.radians(self.whisk.whisking.amplitude_deg))
-            self.whisk, self.sample = self.whisk._replace(amplitude=common), 0
+        ended = self.whisk is None or self.sample >= self.whisk.samples
+        following = self._next or self.whisk
+        if ended and following is not None:
+            common = np.full(len(self._centre), np.radians(following.whisking.amplitude_deg))
+            self.whisk, self._next, self.sample = following._replace(amplitude=common), None, 0
             return whiskers_at_rest(*balance.before.shape)
         return balance
 

@@ -222,7 +222,7 @@ class EmulatedArm:
                 self._order = self._queue.popleft()
                 self._motion = self._start(self._order)
             if self._motion is not None:
-                self._advance(dt)
+                self._advance(self._motion, dt)
         except Unreachable:
             self.order(())
             self._rest()
@@ -248,9 +248,7 @@ class EmulatedArm:
         slower = max(straight, turning, key=lambda profile: profile.duration)
         return _LinearMotion(state.tcp, way, slower) if slower.length > 0 else None
 
-    def _advance(self, dt: float) -> None:
-        motion, joints = self._motion, self.state.joints
-        assert motion is not None
+    def _advance(self, motion: _LinearMotion | StopL, dt: float) -> None:
         scale = 1.0 if isinstance(motion, StopL) else self.scale
         if scale <= 0:
             self._rest()
@@ -260,7 +258,8 @@ class EmulatedArm:
         else:
             tcp, speed, self._motion = motion.advance(dt * scale)
         after = self.solve(tcp)
-        rate = _scale((new - old for new, old in zip(after, joints, strict=True)), 1 / (dt * scale))
+        turned = (new - old for new, old in zip(after, self.state.joints, strict=True))
+        rate = _scale(turned, 1 / (dt * scale))
         self.state = _MotionState(tcp, _scale(speed, scale), after, _scale(rate, scale))
         if self._motion is None:
             self._order = None
