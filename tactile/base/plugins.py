@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
 from pydantic import Field, ValidationError
 
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, did_you_mean
 from tactile.base.settings import Settings
 
 Entry = TypeVar("Entry")
@@ -81,9 +80,9 @@ class Registry(Generic[Entry]):
             return entry
         points = list(entry_points(group=self.group, name=name))
         if not points:
-            close = get_close_matches(name, self.names(), n=1)
-            cure = f"did you mean '{close[0]}'?" if close else ""
-            raise InputError(where, f"'{name}'", f"a {self.noun}: {', '.join(self.names()) or 'none'}", cure)
+            names = self.names()
+            expected = f"a {self.noun}: {', '.join(names) or 'none'}"
+            raise InputError(where, f"'{name}'", expected, did_you_mean(name, names))
         return self._load(points, where)
 
     def _load(self, points: list[EntryPoint], where: str) -> Entry:
