@@ -49,7 +49,7 @@ class Frontend:
         self.head = ur10_head(config.head)
         self.view_shape = view_shape(config.image, self.head)
         self.whiskers = len(self.head.length)
-        self.baseline = RestBaseline.start(self.whiskers)
+        self.baseline = RestBaseline(np.zeros((self.whiskers, 2)), np.zeros(self.whiskers, int))
 
     def features(self, reading: Cycle | Whisk) -> Whisk:
         """The contact features of a reading; whiskers configured as dead or found bent are not alive.
@@ -64,7 +64,7 @@ class Frontend:
             here, config = self.calibration, self.config.baseline
             if config is not None:
                 self.baseline = follow_baseline(config, here, self.baseline, reading)
-                alive = here.alive & ~self.baseline.bent(config)
+                alive = here.alive & (self.baseline.away < config.bent_cycles)
                 here = here._replace(mean=here.mean + self.baseline.offset, alive=alive)
             reading = detect_contacts(self.config.contact, here, reading)
         alive = reading.alive & self.head.alive
