@@ -280,8 +280,8 @@ class HeadSimulation(SimulatedSource):
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
         if self.features is not None:
-            rows = zip(*self.features[2:], strict=True)
-            yield from (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in rows)
+            features = zip(*self.features[2:], strict=True)
+            yield from (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in features)
             return
         assert self.calibration is not None
         random, baseline = stream(self.config.seed, "sensor"), deepcopy(self._baseline)
