@@ -76,9 +76,8 @@ class TouchSource(ClosedSource):
     def __init__(self, source: Source, start: Callable[[], ReadingProcessor], where: str) -> None:
         first = start()
         if source.whiskers != first.whiskers:
-            raise InputError(
-                where, f"{first.whiskers} whiskers", f"{source.whiskers}, those of {source.name}"
-            )
+            expected = f"{source.whiskers}, those of {source.name}"
+            raise InputError(where, f"{first.whiskers} whiskers", expected)
         self.source, self.start = source, start
         self.name, self.rate_hz, self.digest = source.name, source.rate_hz, source.digest
         self.view_shape, self.whiskers, self.length = first.view_shape, source.whiskers, source.length

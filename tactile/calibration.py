@@ -423,20 +423,12 @@ class RestBaseline(NamedTuple):
     """Baselines of W whiskers.
 
     Attributes:
-        offset: [W, 2] drift since the calibration, rad. away: [W] cycles on end away from the baseline.
+        offset: [W, 2] drift since the calibration, rad. away: [W] cycles on end away from the baseline; a
+            whisker that stays away for `bent_cycles` is bent.
     """
 
     offset: np.ndarray
     away: np.ndarray
-
-    @classmethod
-    def start(cls, whiskers: int) -> RestBaseline:
-        """Baselines as calibrated."""
-        return cls(np.zeros((whiskers, 2)), np.zeros(whiskers, int))
-
-    def bent(self, config: RestBaselineConfig) -> np.ndarray:
-        """[W] bool, whiskers that stayed away from their baselines."""
-        return self.away >= config.bent_cycles
 
 
 def follow_baseline(

@@ -203,9 +203,8 @@ def _continue_block(
     home = np.where(state.bent[:, None], 0.0, (state.home - state.baseline) / plan.noise)
     departure = np.maximum(low - np.maximum(home, 0.0), np.minimum(home, 0.0) - high).max(axis=-1)
     sums = np.concatenate([state.total[None], deviation[plan.window - 1 :]])
-    later = state._replace(
-        row=state.row + len(samples), recent=known[len(samples) :], total=np.add.accumulate(sums)[-1]
-    )
+    total = np.add.accumulate(sums)[-1]
+    later = state._replace(row=state.row + count, recent=known[count:], total=total)
     begins = departure > plan.on + state.allowance
     if not (state.contact.any() or begins.any()):
         return later, begins

@@ -62,16 +62,11 @@ def radial_distance(config: ShaftConfig, ratio: Array) -> np.ndarray:
     return 1 / np.maximum(nearness, 1.0)
 
 
-def detect_contacts(
-    config: ContactConfig, calibration: Calibration, cycle: Cycle, where: str = "touch"
-) -> Whisk:
+def detect_contacts(config: ContactConfig, calibration: Calibration, cycle: Cycle) -> Whisk:
     """The contact features of one whisk cycle.
 
     A whisker with a NaN sample counts as not alive for the cycle; in a cycle without samples (its stream was
     dropped) no whisker is alive.
-
-    Args:
-        where: name of the stream in errors.
 
     Raises:
         InputError: the stream has gaps, is cut off or is sampled too slowly for the slope window.
@@ -79,11 +74,11 @@ def detect_contacts(
     if not len(cycle.time):
         no, zero = np.zeros(len(calibration.alive), bool), np.zeros(len(calibration.alive))
         return Whisk(cycle.odometry, no, no, zero, no, zero, zero)
-    rate = sample_rate(cycle.time, config.slope_window, where)
+    rate = sample_rate(cycle.time, config.slope_window, "touch")
     window = round(config.slope_window * rate)
     if len(cycle.time) < 2 * window:
         found = f"a cycle of {len(cycle.time)} samples"
-        raise InputError(where, found, "a whole whisk", "the stream is cut off")
+        raise InputError("touch", found, "a whole whisk", "the stream is cut off")
     alive = calibration.alive & np.isfinite(cycle.angle).all(axis=0)
     alive = alive & np.isfinite(cycle.deflection).all(axis=(0, 2))
     angle = np.where(alive, cycle.angle, 0.0)

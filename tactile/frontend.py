@@ -49,7 +49,7 @@ class Frontend:
         self.head = ur10_head(config.head)
         self.view_shape = view_shape(config.image, self.head)
         self.whiskers = len(self.head.length)
-        self.baseline = RestBaseline.start(self.whiskers)
+        self.baseline = RestBaseline(np.zeros((self.whiskers, 2)), np.zeros(self.whiskers, int))
 
     def features(self, reading: Cycle | Whisk) -> Whisk:
         """The contact features of a reading; whiskers configured as dead or found bent are not alive.
@@ -61,21 +61,14 @@ class Frontend:
             if self.calibration is None:
                 found = "raw whisker samples without a calibration"
                 raise InputError("calibration", found, "a free-whisking record")
-            reading = self._detect(self.calibration, reading)
+            here, config = self.calibration, self.config.baseline
+            if config is not None:
+                self.baseline = follow_baseline(config, here, self.baseline, reading)
+                alive = here.alive & (self.baseline.away < config.bent_cycles)
+                here = here._replace(mean=here.mean + self.baseline.offset, alive=alive)
+            reading = detect_contacts(self.config.contact, here, reading)
         alive = reading.alive & self.head.alive
         return reading._replace(alive=alive, contact=reading.contact & alive, held=reading.held & alive)
-
-    def _detect(self, calibration: Calibration, cycle: Cycle) -> Whisk:
-        """The contacts of raw samples, relative to the baseline as the settings want it."""
-        config = self.config.baseline
-        if config is None:
-            return detect_contacts(self.config.contact, calibration, cycle)
-        self.baseline = follow_baseline(config, calibration, self.baseline, cycle)
-        here = calibration._replace(
-            mean=calibration.mean + self.baseline.offset,
-            alive=calibration.alive & ~self.baseline.bent(config),
-        )
-        return detect_contacts(self.config.contact, here, cycle)
 
     def observe(self, reading: Observation | Cycle | Whisk | Report) -> Observation:
         """The observation of a reading; an `Observation` is returned unchanged.

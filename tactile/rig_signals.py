@@ -90,20 +90,18 @@ def fit_head(
     plain = least_squares(errors, values, diff_step=STEP, max_nfev=1)  # the derivatives without the loss
     after, assumed_error = (float(robust_sd(errors(at))) for at in (values, before))
     sd = _uncertainties(plain.jac, errors(values), scale)
-    radii = tuple(  # a radius that is not known to its own size is unknown
-        (float(value), float(one)) if one < value else None
-        for value, one in zip(values[1:], sd[1:], strict=True)
-    )
-    return (float(values[0]), float(sd[0])), radii, len(row), (after, assumed_error)
+    rest, *fitted = zip(values.tolist(), sd.tolist(), strict=True)
+    # A radius that is not known to its own size is unknown.
+    radii = tuple((radius, one) if one < radius else None for radius, one in fitted)
+    return rest, radii, len(row), (after, assumed_error)
 
 
 def head_with(assumed: HeadConfig, values: np.ndarray) -> HeadConfig:
     """The head with another rest angle (degrees) and other radii (m): `values` [1 + rings]."""
-    rings = tuple(
-        ring.model_copy(update={"radius": float(radius)})
-        for ring, radius in zip(assumed.rings, values[1:], strict=True)
-    )
-    return assumed.model_copy(update={"rest_deg": float(values[0]), "rings": rings})
+    rest, *radii = values.tolist()
+    pairs = zip(assumed.rings, radii, strict=True)
+    rings = tuple(ring.model_copy(update={"radius": radius}) for ring, radius in pairs)
+    return assumed.model_copy(update={"rest_deg": rest, "rings": rings})
 
 
 def _uncertainties(slope: np.ndarray, error: np.ndarray, scale: float) -> np.ndarray:
@@ -181,9 +179,8 @@ def fit_signals(record: SignalRecord) -> SignalFit:
         baseline[live], noise[live] = free.mean, free.noise
         white[live] = np.minimum(estimate_noise(record.free[:, live], lag=1), free.noise)
         # Per root of a sample of `drifting`; a block of these stands for `block_time`.
-        walk = estimate_drift(record.drifting[:, live], record.block) * np.sqrt(
-            record.block / record.block_time
-        )
+        each_second = np.sqrt(record.block / record.block_time)
+        walk = estimate_drift(record.drifting[:, live], record.block) * each_second
         drift[live] = np.where(record.contact[live, None] > MOST_CONTACT, np.nan, walk)
         numbers = np.flatnonzero(live)
         dirty = {int(numbers[whisker]): reason for whisker, reason in free.dirty.items()}

@@ -8,7 +8,6 @@ of different places.
 from __future__ import annotations
 
 from collections.abc import Callable
-from difflib import get_close_matches
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ from evaluation.metrics.metric import Finding, Metric, Quantity
 from evaluation.metrics.occupancy_score import GRID_METRICS
 from evaluation.metrics.run_metrics import RUN_METRICS
 from evaluation.metrics.statistics import auc
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, did_you_mean
 from tactile.base.se2 import wrap
 
 MEASURED = (
@@ -80,9 +79,7 @@ def find_error(name: str) -> str:
     found = ERRORS.get(name, name)
     if found not in METRICS or METRICS[found].direction is None or METRICS[found] in MEASURED:
         every = [*ERRORS, *(each.name for each in METRICS.values() if each.direction)]
-        near = get_close_matches(name, every, n=1)
-        cure = f"did you mean {near[0]!r}?" if near else ""
-        raise InputError("--error", repr(name), f"one of {', '.join(ERRORS)}, ...", cure)
+        raise InputError("--error", repr(name), f"one of {', '.join(ERRORS)}, ...", did_you_mean(name, every))
     return found
 
 

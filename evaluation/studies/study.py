@@ -10,7 +10,6 @@ import copy
 import hashlib
 import json
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from difflib import get_close_matches
 from functools import partial
 from itertools import combinations, product
 from math import prod
@@ -34,15 +33,14 @@ from ratslam.runs.settings.packaged import find_config
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import Document, load, open_path, override, validate
 from ratslam.runs.settings.yaml_document import KeyPath, Place
-from tactile.base.errors import InputError, InputErrors
+from tactile.base.errors import InputError, InputErrors, did_you_mean
 from tactile.base.settings import Settings
 
 
 def _quantity_name(name: str, *, directed: bool = False) -> str:
     """The name of a quantity, with `directed` of one of which large or small values are better."""
     if name not in METRICS:
-        near = get_close_matches(name, METRICS, n=1)
-        cure = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(COLUMNS['means'])} and others"
+        cure = did_you_mean(name, METRICS) or f"there are {', '.join(COLUMNS['means'])} and others"
         raise ValueError(f"no quantity of that name; {cure}")
     if directed and METRICS[name].direction is None:
         raise ValueError("neither large nor small is better; list it in minimise or maximise")

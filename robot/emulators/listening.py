@@ -1,18 +1,26 @@
-"""The addresses on which emulators listen: loopback, unless the network is asked for; and fault requests.
+"""The addresses on which emulators listen: loopback, unless the network is asked for; fault requests; and
+emulators as programs.
 
 A fault request is an object {"do": name, ...} with the arguments of the fault.
 """
 
 from __future__ import annotations
 
+import argparse
 import errno
 import ipaddress
 import json
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
 
 from tactile.base.errors import InputError
+from tactile.base.settings import Settings
+
+Model = TypeVar("Model", bound=Settings)
 
 OPENS = "anyone who reaches this address may command, fault or stop the emulator"
 
@@ -44,6 +52,24 @@ def is_loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return False
+
+
+def run_emulator(arguments: argparse.Namespace, model: type[Model], serve: Callable[[Model], None]) -> int:
+    """Serves an emulator until the process is ended; returns the exit code.
+
+    Args:
+        arguments: `config`, settings as JSON, and settings by name, which override them; None: not given.
+    """
+    given = {key: value for key, value in vars(arguments).items() if value is not None}
+    try:
+        written = model.model_validate_json(given.pop("config", "{}"))
+        serve(model.model_validate(written.model_dump() | given))
+    except (InputError, ValidationError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        pass
+    return 0
 
 
 def do_fault(known: Mapping[str, Callable[..., Any]], request: Mapping[str, Any]) -> dict[str, Any]:

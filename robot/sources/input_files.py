@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
 
-from tactile.base.errors import InputError, InputErrors
+from tactile.base.errors import InputError, InputErrors, did_you_mean
 
 MOST_NAMES = 12
 """Existing names that an error lists."""
@@ -25,8 +24,7 @@ def require_file(path: Path) -> None:
             raise InputError(str(path), "is a folder", "a file")
         if not path.exists():
             try:
-                close = get_close_matches(path.name, [other.name for other in path.parent.iterdir()], n=1)
-                cure = f"did you mean {close[0]!r}?" if close else ""
+                cure = did_you_mean(path.name, [other.name for other in path.parent.iterdir()])
             except OSError:
                 cure = f"the folder {path.parent} does not exist"
             raise InputError(str(path), "no such file", "an existing file", cure)
@@ -81,8 +79,7 @@ def missing_error(where: str, kind: str, name: str, there: Sequence[str], key: s
         kind: of the missing name, such as 'column' or 'array'. there: the existing names.
         key: configuration key in which the name was given, if any.
     """
-    close = get_close_matches(name, there, n=1)
-    cure = f"did you mean {close[0]!r}?" if close else (f"name the {kind} with {key}" if key else "")
+    cure = did_you_mean(name, there) or (f"name the {kind} with {key}" if key else "")
     shown = ", ".join(map(repr, there[:MOST_NAMES])) or "(nothing)"
     if len(there) > MOST_NAMES:
         shown += f" and {len(there) - MOST_NAMES} more"

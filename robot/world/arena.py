@@ -80,7 +80,7 @@ class Arena(NamedTuple):
 
 def wall_segments(arena: Arena) -> np.ndarray:
     """All wall segments [S, 4], x1, y1, x2, y2, m, those of objects included."""
-    return np.vstack([polygon_edges(arena.outer), *(polygon_edges(polygon) for polygon in arena.objects)])
+    return np.vstack([polygon_edges(polygon) for polygon in (arena.outer, *arena.objects)])
 
 
 def read_arena(path: File) -> Arena:

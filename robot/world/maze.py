@@ -141,8 +141,7 @@ def random_loop(columns: int, rows: int, length: int, random: np.random.Generato
 
 
 def _outline_length(blob: np.ndarray) -> int:
-    padded = np.pad(blob, 1)
-    return int((padded[1:] != padded[:-1]).sum() + (padded[:, 1:] != padded[:, :-1]).sum())
+    return sum(int(np.diff(np.pad(blob, 1), axis=axis).sum()) for axis in (0, 1))
 
 
 def _keeps_one_outline(blob: np.ndarray, i: int, j: int) -> bool:
@@ -150,13 +149,9 @@ def _keeps_one_outline(blob: np.ndarray, i: int, j: int) -> bool:
     padded = np.pad(blob, 1)
     ring = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
     around = [bool(padded[i + 1 + di, j + 1 + dj]) for di, dj in ring]
-    sides = around[::2]
     changes = sum(a != b for a, b in zip(around, around[1:] + around[:1], strict=True))
-    return (
-        any(sides)
-        and changes == 2
-        and not any(around[k] and not (around[k - 1] or around[(k + 1) % 8]) for k in (1, 3, 5, 7))
-    )
+    alone = any(around[k] and not (around[k - 1] or around[(k + 1) % 8]) for k in (1, 3, 5, 7))
+    return any(around[::2]) and changes == 2 and not alone
 
 
 def _trace_outline(blob: np.ndarray, random: np.random.Generator) -> list[Cell]:
@@ -246,10 +241,8 @@ def parse_maze(text: str, path: Path) -> Maze:
     Raises:
         InputError: the text has an unexpected character, or lacks an outer wall.
     """
-    lines = [line.rstrip() for line in text.splitlines()]
+    lines = [line.rstrip() for line in text.rstrip().splitlines()]
     skipped = next((number for number, line in enumerate(lines) if line), 0)
-    while lines and not lines[-1]:
-        lines.pop()
     lines = lines[skipped:]
     rows, width = len(lines) // 2, max((len(line) for line in lines), default=0)
     columns = (width - 1) // 4

@@ -22,7 +22,6 @@ from robot.world.maze import (
     change_walls,
     check_route,
     circuit_route,
-    closed_maze,
     describe_box,
     exploration_route,
     make_anticlockwise,
@@ -165,9 +164,8 @@ class MazeConfig(Settings):
     @model_validator(mode="after")
     def _one_height(self) -> MazeConfig:
         if (self.added or self.removed) and len(self.heights) > 1:
-            raise ValueError(
-                "added and removed walls need one height; several are drawn in order of the walls"
-            )
+            cause = "several are drawn in order of the walls"
+            raise ValueError(f"added and removed walls need one height; {cause}")
         return self
 
 
@@ -256,8 +254,7 @@ def make_scene(
         when = np.linspace(0.25, 0.95, kidnaps.count) * duration
         path, jumps = add_kidnaps(path, when.tolist(), kidnaps.ahead)
     boxes = wall_boxes(maze, stream(maze_seed(maze_config, seed), "maze.heights"), maze_config.heights)
-    surroundings = _check_surroundings(boxes, head, path)
-    return Scene(maze, loop, path, duration, jumps, surroundings)
+    return Scene(maze, loop, path, duration, jumps, _check_surroundings(boxes, head, path))
 
 
 def other_surroundings(scene: Scene, config: MazeConfig, head: Head, seed: int) -> Surroundings:
@@ -318,10 +315,11 @@ def make_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, li
     """
     seed = maze_seed(config, seed)
     loop: list[Cell] = []
-    maze = read_maze(config.file) if config.file else closed_maze(config.columns, config.rows)
+    columns, rows = config.columns, config.rows
+    empty = Maze(np.zeros((rows + 1, columns), bool), np.zeros((rows, columns + 1), bool))
+    maze = read_maze(config.file) if config.file else empty
     if path.loop:
-        empty = Maze(np.zeros_like(maze.across), np.zeros_like(maze.along))
-        check_route(maze if config.file else empty, [*path.loop, path.loop[0]], "simulation.path.loop")
+        check_route(maze, [*path.loop, path.loop[0]], "simulation.path.loop")
         loop = make_anticlockwise(path.loop)
     if config.file:
         if path.circuits and not loop:
@@ -333,8 +331,8 @@ def make_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, li
             cure = "explore, or use `simulation.maze.kind: loop`"
             raise InputError("simulation.path", "circuits in a maze without loops", "an exploration", cure)
         if config.kind == "loop" and not loop:
-            loop = random_loop(config.columns, config.rows, config.loop, stream(seed, "maze.loop"))
-        maze = _draw_walls(config, config.columns, config.rows, loop, stream(seed, "maze.walls"))
+            loop = random_loop(columns, rows, config.loop, stream(seed, "maze.loop"))
+        maze = _draw_walls(config, columns, rows, loop, stream(seed, "maze.walls"))
     return change_walls(maze, config.added, config.removed), loop
 
 

@@ -92,9 +92,8 @@ class Surroundings:
             self._near[i, j] = np.flatnonzero(inside)
         return self._near[i, j]
 
-    def _first_contacts(
-        self, pose: np.ndarray, near: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _first_contacts(self, pose: np.ndarray, near: np.ndarray) -> Contact:
+        """First contacts with the boxes `near` [B]."""
         enter, leave = self._crossings(pose, self.walls.box[near])  # [P, A, B]
         met = np.full((len(pose), len(self.radius)), NO_CONTACT)
         reach, wall = np.zeros(met.shape), np.full(met.shape, -1)
@@ -110,7 +109,7 @@ class Surroundings:
         met[place], reach[place], wall[place] = angle[order], share[order], near[box[order]]
         free = ~np.isfinite(met)
         reach[free], wall[free] = 0.0, -1
-        return met, reach, wall
+        return Contact(met, reach, wall)
 
     def _crossings(self, pose: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distances [P, A, B] at which each ray of each pose enters and leaves each box."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,11 @@ def os_errors_of(path: str | Path, found: str, expected: str, cure: str = "") ->
         yield
     except OSError as error:
         raise InputError(str(path), f"{found} ({error.strerror or error})", expected, cure) from None
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The cure that suggests the known name most like an unknown one; '' if none is alike."""
+    return "".join(f"did you mean {close!r}?" for close in get_close_matches(name, list(known), n=1))
 
 
 def printable(text: str) -> str:

@@ -84,9 +84,8 @@ def _is_of(error: OSError, temporary: Path) -> bool:
     it, or without any name, as those of open files are."""
     if error.errno is None:
         return False
-    named = [
-        Path(os.fsdecode(name)) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)
-    ]
+    names = error.filename, error.filename2
+    named = [Path(os.fsdecode(name)) for name in names if isinstance(name, str | bytes)]
     own = [name == temporary or temporary in name.parents for name in named]
     return not own or own[0] or (any(own) and error.errno in FULL)
 
@@ -217,6 +216,5 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 def _appeared(path: Path) -> InputError:
-    return InputError(
-        str(path), "another program has made it meanwhile; it stays as it is", "a new file", CURE
-    )
+    found = "another program has made it meanwhile; it stays as it is"
+    return InputError(str(path), found, "a new file", CURE)

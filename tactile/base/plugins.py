@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
 from pydantic import Field, ValidationError
 
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, did_you_mean
 from tactile.base.settings import Settings
 
 Entry = TypeVar("Entry")
@@ -52,9 +51,8 @@ class Registry(Generic[Entry]):
             TypeError: `entry` is of another type.
         """
         if not isinstance(entry, self._kind):
-            raise TypeError(
-                f"a {self.noun} is registered as a {self._kind.__name__}, not a {type(entry).__name__}"
-            )
+            wanted, given = self._kind.__name__, type(entry).__name__
+            raise TypeError(f"a {self.noun} is registered as a {wanted}, not a {given}")
         if name in self.builtin or self._registered.get(name, entry) is not entry:
             raise ValueError(f"the {self.noun} '{name}' is registered already")
         self._registered[name] = entry
@@ -82,9 +80,9 @@ class Registry(Generic[Entry]):
             return entry
         points = list(entry_points(group=self.group, name=name))
         if not points:
-            close = get_close_matches(name, self.names(), n=1)
-            cure = f"did you mean '{close[0]}'?" if close else ""
-            raise InputError(where, f"'{name}'", f"a {self.noun}: {', '.join(self.names()) or 'none'}", cure)
+            names = self.names()
+            expected = f"a {self.noun}: {', '.join(names) or 'none'}"
+            raise InputError(where, f"'{name}'", expected, did_you_mean(name, names))
         return self._load(points, where)
 
     def _load(self, points: list[EntryPoint], where: str) -> Entry:
@@ -95,10 +93,8 @@ class Registry(Generic[Entry]):
         try:
             entry = points[0].load()
         except Exception as error:  # whatever a package does while it is imported
-            cause = f"{type(error).__name__}: {error}"
-            raise InputError(
-                where, f"{found} cannot be loaded: {cause}", cure="repair or remove it"
-            ) from error
+            found += f" cannot be loaded: {type(error).__name__}: {error}"
+            raise InputError(where, found, cure="repair or remove it") from error
         if not isinstance(entry, self._kind):
             raise InputError(where, f"{found} is of type {type(entry).__name__}", self._kind.__name__)
         return entry

@@ -98,8 +98,7 @@ def _covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _factor(where: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    factor: np.ndarray = cholesky(_covariance(where, where) + np.diag(noise**2), lower=True)
-    return factor
+    return np.asarray(cholesky(_covariance(where, where) + np.diag(noise**2), lower=True))
 
 
 def _most_likely(away: np.ndarray, value: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, float]:

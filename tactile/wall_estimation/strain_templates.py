@@ -200,15 +200,12 @@ def train_templates(
         few = ", ".join(f"{count[k]} at {np.degrees(angles[k]):.3g} degrees" for k in less)
         where = f"{training.repeats} at each angle"
         raise InputError(TEMPLATES, f"too few drives: {few}", where, "add drives")
-    sets = []
-    for at in near.T:
-        chosen = [drives[k].strain[: training.samples] for k in np.flatnonzero(at)]
-        sets.append(np.stack([filter_strain(training, strain) for strain in chosen]))
+    filtered = [filter_strain(training, drive.strain[: training.samples]) for drive in drives]
+    sets = [np.stack([filtered[k] for k in np.flatnonzero(at)]) for at in near.T]
     mean = np.stack([one.mean(axis=0) for one in sets])
     # Most channels have no contact most of the time, so the median measures noise.
-    square = np.concatenate(
-        [((one - one.mean(axis=0)) ** 2).swapaxes(1, 2).reshape(-1, training.samples, 2) for one in sets]
-    ) / (1 - 1 / count.min())
+    parts = [((one - one.mean(axis=0)) ** 2).swapaxes(1, 2).reshape(-1, training.samples, 2) for one in sets]
+    square = np.concatenate(parts) / (1 - 1 / count.min())
     return StrainTemplates(training, angles, mean, np.sqrt(np.median(square, axis=0) / SQUARE_MEDIAN))
 
 
@@ -360,9 +357,8 @@ def direction_misfit(tip: TipModel, whisker: int, strain: np.ndarray) -> tuple[n
     side = np.sign(across.sum())
     nearer = _nearer(tip, whisker, WALL_DIRECTIONS, side)
     time, noise = tip.time[: len(rows)], tip.noise[: len(rows)]
-    misfit, distance, slant, use = _sliding(
-        tip, whisker, nearer, np.sin(WALL_DIRECTIONS), across, np.ones(len(across), bool)
-    )
+    slope, every = np.sin(WALL_DIRECTIONS), np.ones(len(across), bool)
+    misfit, distance, slant, use = _sliding(tip, whisker, nearer, slope, across, every)
     expected = tip.crosstalk * across - np.abs(across) * (_between(slant) @ tip.share)
     sd = np.hypot(noise[:, 1], VERTICAL_MODEL_SD * across)
     vertical = _mean(((down - expected) / sd) ** 2, use)
@@ -371,7 +367,7 @@ def direction_misfit(tip: TipModel, whisker: int, strain: np.ndarray) -> tuple[n
     possible = ~grazing & (nearer < np.pi / 2 + RIGHT_ANGLE_MARGIN) & (use.sum() >= 2)
     possible &= bool(np.abs(across[:1]).max(initial=0.0) < MAX_FIRST_TURN * tip.gain)
     last = time[-1] if len(time) else 0.0
-    away = distance - tip.speed * np.sin(WALL_DIRECTIONS) * last
+    away = distance - tip.speed * slope * last
     return np.where(possible, misfit + vertical, np.inf), away, int(use.sum())
 
 

@@ -104,8 +104,8 @@ class VirtualArm:
         features = simulate_kinematic(self._setup, self.surroundings, path, np.array([begin]), self._random)
         stamp = begin + MID_PROTRACTION * period
         odometry, truth = self._odometer.step(stamp, stamp)
-        alive = self._setup.head.alive
-        return Sample(stamp, Whisk(odometry, alive, *(column[0] for column in features)), truth)
+        columns = (column[0] for column in features[2:])
+        return Sample(stamp, Whisk(odometry, features.alive, *columns), truth)
 
     def whisks(self) -> Iterator[Sample]:
         """Whisk after whisk, without end."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
 
-from tactile.base.errors import InputError
+from tactile.base.errors import InputError, did_you_mean
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 FOLDERS = (_PACKAGE / "packaged" / "configs", _PACKAGE.parent / "configs")
@@ -45,8 +44,7 @@ def find_config(text: str | os.PathLike[str], folder: Path = Path()) -> Path:
         return path
     if name in files:
         return files[name]
-    close = get_close_matches(Path(name).stem.lower(), files, n=1)
-    cure = f"did you mean {close[0]!r}?" if close else ""
+    cure = did_you_mean(Path(name).stem.lower(), files)
     raise InputError(str(path), "no such file or packaged configuration", f"one of {', '.join(files)}", cure)
 
 

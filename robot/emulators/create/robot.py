@@ -35,13 +35,8 @@ class _WheelState(NamedTuple):
         half = turn / 2
         chord = way * (math.sin(half) / half if half else 1.0)
         middle = self.heading + half
-        return _WheelState(
-            self.x + chord * math.cos(middle),
-            self.y + chord * math.sin(middle),
-            self.heading + turn,
-            self.travelled + way,
-            self.turned + turn,
-        )
+        x, y = self.x + chord * math.cos(middle), self.y + chord * math.sin(middle)
+        return _WheelState(x, y, self.heading + turn, self.travelled + way, self.turned + turn)
 
 
 class EmulatedCreate:

@@ -86,8 +86,6 @@ class Terminal:
 
     def plug(self) -> None:
         """Makes the terminal, or a new one after `unplug`."""
-        if self.plugged:
-            return
         self.master, self._slave = os.openpty()  # the slave stays open: without one, reads fail
         self._tty.setraw(self._slave)
         os.set_blocking(self.master, False)
@@ -138,12 +136,10 @@ class _CreateServer:
         self.terminal = Terminal(config.port)
         self.began = time.monotonic()
         self._free = 0.0  # loop time at which the line has sent everything
-        self._loop: asyncio.AbstractEventLoop | None = None
 
     def start(self) -> None:
         """Serves the serial line in the running event loop."""
-        self._loop = asyncio.get_running_loop()
-        self._loop.add_reader(self.terminal.master, self._receive)
+        asyncio.get_running_loop().add_reader(self.terminal.master, self._receive)
 
     def move(self, now: float) -> None:
         """Advances the robot to a time, s, host's monotonic clock."""
@@ -176,14 +172,14 @@ class _CreateServer:
         self.faults.lose = self.faults.scramble = 0
 
     def _unplug(self) -> None:
-        if self.terminal.plugged and self._loop is not None:
-            self._loop.remove_reader(self.terminal.master)
+        if self.terminal.plugged:
+            asyncio.get_running_loop().remove_reader(self.terminal.master)
         self.terminal.unplug()
 
     def _plug(self) -> None:
-        if not self.terminal.plugged and self._loop is not None:
+        if not self.terminal.plugged:
             self.terminal.plug()
-            self._loop.add_reader(self.terminal.master, self._receive)
+            self.start()
 
     def _state(self) -> dict[str, Any]:
         robot = self.robot
@@ -216,14 +212,14 @@ class _CreateServer:
 
     def _send(self, piece: bytes, after: float) -> None:
         """Sends bytes some time, s, after all bytes before them."""
-        assert self._loop is not None
-        now, master = self._loop.time(), self.terminal.master
+        loop = asyncio.get_running_loop()
+        now, master = loop.time(), self.terminal.master
         self._free = max(self._free, now) + after
         if self._free <= now:
             self._write(master, piece)
         else:
             self._free += 1e-6  # the order of equal times is not defined
-            self._loop.call_at(self._free, self._write, master, piece)
+            loop.call_at(self._free, self._write, master, piece)
 
     def _write(self, master: int, piece: bytes) -> None:
         if self.terminal.plugged and master == self.terminal.master:
@@ -322,15 +318,12 @@ class CreateWhiskers(SensorArray):
         rolls = bool(self._robot.right or self._robot.left)
         if changed and rolls:
             self._shaking.start()
-        rumble = self._shaking.rumble(self._samples, rolls)
-        shake = self._shaking.ring(self._samples) + rumble
+        shake = self._shaking.ring(self._samples) + self._shaking.rumble(self._samples, rolls)
         strain = base_strains(self.config.whiskers, self._fan, bent) + shake[:, None]
         strain += self.config.whiskers.noise * self._random.standard_normal(strain.shape)
         strain = np.where(self._fan.alive[:, None], strain, 0.0)
-        still = np.zeros(self._samples, bool)
-        return Block(
-            np.zeros(strain.shape[:2]), strain / self.config.strain_per_radian, still, fed_back=False
-        )
+        angle, begins = np.zeros(strain.shape[:2]), np.zeros(self._samples, bool)
+        return Block(angle, strain / self.config.strain_per_radian, begins, fed_back=False)
 
     def skip_block(self) -> None:
         self._pose = self._robot.pose

@@ -15,23 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from robot.drivers.head import usb_protocol as usb
 from robot.drivers.head.emulated_cable import usb_error
-from robot.drivers.head.usb_protocol import (
-    CHANNELS,
-    ENDPOINT_IN,
-    ENDPOINT_OUT,
-    INTERFACE,
-    PRODUCT,
-    REQUEST_IN,
-    VENDOR,
-    VERSION,
-    Command,
-    FrameFlag,
-    Request,
-    frame_values,
-    pack_frames,
-    to_counts,
-)
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig
 from robot.emulators.head.whiskers import Block, SensorArray, block_samples
 from robot.emulators.listening import do_fault
@@ -45,11 +30,13 @@ PACKET = 512
 """Size of a high-speed bulk packet, bytes."""
 
 
-_ENDS = b"".join(struct.pack("<BBBBHB", 7, 5, end, 2, PACKET, 0) for end in (ENDPOINT_IN, ENDPOINT_OUT))
+_ENDS = b"".join(
+    struct.pack("<BBBBHB", 7, 5, end, 2, PACKET, 0) for end in (usb.ENDPOINT_IN, usb.ENDPOINT_OUT)
+)
 DESCRIPTORS = (
-    struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0xFF, 0, 0, 64, VENDOR, PRODUCT, 0x0100, 1, 2, 3, 1)
+    struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0xFF, 0, 0, 64, usb.VENDOR, usb.PRODUCT, 0x0100, 1, 2, 3, 1)
     + struct.pack("<BBHBBBBB", 9, 2, 9 + 9 + len(_ENDS), 1, 1, 0, 0xC0, 0)
-    + struct.pack("<9B", 9, 4, INTERFACE, 0, 2, 0xFF, 0, 0, 0)
+    + struct.pack("<9B", 9, 4, usb.INTERFACE, 0, 2, 0xFF, 0, 0, 0)
     + _ENDS
 )
 """Descriptors of the device (USB 2.0, vendor-specific class) and of its only configuration (self-powered, one
@@ -110,7 +97,7 @@ class EmulatedHead:
 
     def bulk_out(self, packet: bytes, now: float) -> None:
         """Executes a command packet; an invalid one is ignored and counted."""
-        command = Command.unpack(packet)
+        command = usb.Command.unpack(packet)
         if command is None:
             self.received[""] += 1
             return
@@ -133,8 +120,8 @@ class EmulatedHead:
             answer = b"\1"
         elif (kind, request) in (CONFIGURE, ALTERNATE):
             answer = b""
-        elif kind & 0x60 == REQUEST_IN & 0x60 and request in set(Request):
-            answer = self._vendor(Request(request), now)
+        elif kind & 0x60 == usb.REQUEST_IN & 0x60 and request in set(usb.Request):
+            answer = self._vendor(usb.Request(request), now)
         if answer is None:
             raise usb_error(errno.EPIPE)
         return answer[:size]
@@ -177,40 +164,40 @@ class EmulatedHead:
             "late": now - self.due + self.samples / (self.config.stream.rate * self._pace),
         }
 
-    def _vendor(self, request: Request, now: float) -> bytes:
-        if request == Request.START:
+    def _vendor(self, request: usb.Request, now: float) -> bytes:
+        if request == usb.Request.START:
             self.fifo.clear()
             self.streaming = True
             self.whiskers.begin(self._when(self._made))
-        elif request == Request.STOP:
+        elif request == usb.Request.STOP:
             self.halt()
-        elif request == Request.CLOCK:
+        elif request == usb.Request.CLOCK:
             seconds = self.config.age + (now - self.began) * self._pace
             return max(round(seconds * 1e6) + self.faults.jump, 0).to_bytes(8, "little")
         else:
             identity = {
                 "name": "emulated head",
-                "version": f"{VERSION}",
+                "version": f"{usb.VERSION}",
                 "whiskers": self.whiskers.count,
-                "channels": CHANNELS,
+                "channels": usb.CHANNELS,
                 "rate": self.config.stream.rate,
             }
             return json.dumps(identity).encode()
         return b""
 
     def _send(self, block: Block, now: float) -> None:
-        flags = np.where(block.begins, FrameFlag.CYCLE, 0) | (FrameFlag.RCP if block.fed_back else 0)
-        values = frame_values(block.angle, block.deflection)
+        flags = np.where(block.begins, usb.FrameFlag.CYCLE, 0) | (usb.FrameFlag.RCP if block.fed_back else 0)
+        values = usb.frame_values(block.angle, block.deflection)
         values = self.faults.saturate_values(values, self.config.stream.full_scale, now)
         some = slice(self.samples - self.faults.count_unskipped(self.samples), None)
         sample = self._made + np.arange(self.samples)[some]
         if len(sample) == 0:
             return
         flags = flags[some]
-        flags[0] |= FrameFlag.OVERRUN if self.fifo.overran else 0
+        flags[0] |= usb.FrameFlag.OVERRUN if self.fifo.overran else 0
         number = self._first + sample
         time = np.rint(number * (1e6 / self.config.stream.rate)).astype(np.int64) + self.faults.jump
-        raw = pack_frames(number, time, flags, values[some])
+        raw = usb.pack_frames(number, time, flags, values[some])
         size = len(raw) // len(sample)
         frames = [raw[k : k + size] for k in range(0, len(raw), size)]
         self.fifo.push(self.faults.damage_frames(frames))
@@ -274,7 +261,7 @@ class _HeadFaults:
         """Values [T, W, 3], with the deflections of saturated whiskers at full scale (rad)."""
         for whisker, until in list(self._saturated.items()):
             if now < until:
-                values[:, whisker, 1:] = to_counts(np.array(full_scale))
+                values[:, whisker, 1:] = usb.to_counts(np.array(full_scale))
             else:
                 del self._saturated[whisker]
         return values

@@ -11,6 +11,7 @@ import contextlib
 import errno
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from typing import Any
 
 from robot.drivers.head.emulated_cable import ANSWER, IN, REQUEST, Op, usb_error
@@ -73,22 +74,18 @@ async def open_server(
     server = _HeadServer(bridge, do)
     async with contextlib.AsyncExitStack() as stack:
         for client, port in ((server.usb, config.port), (server.faults, config.control_port)):
-            talk = _ignore_disconnects(client)
+            talk = partial(_talk, client)
             with listening(config.host, port, config.open_to_network):
                 opened = await asyncio.start_server(talk, config.host, port, reuse_address=True)
             await stack.enter_async_context(opened)
         yield server
 
 
-def _ignore_disconnects(client: Client) -> Client:
-    """Wraps a client handler so that a disconnection is not an error."""
-
-    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with contextlib.suppress(*ENDS):
-            await client(reader, writer)
-        writer.close()
-
-    return talk
+async def _talk(client: Client, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Serves a client; a disconnection is no error."""
+    with contextlib.suppress(*ENDS):
+        await client(reader, writer)
+    writer.close()
 
 
 class _HeadServer:

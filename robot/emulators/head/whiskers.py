@@ -11,14 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from robot.drivers.head.usb_protocol import (
-    ANGLE,
-    COMMAND_TIMEOUT,
-    NO_THRESHOLD,
-    Command,
-    CommandKind,
-    FeedbackMode,
-)
+from robot.drivers.head import usb_protocol as usb
 from robot.drivers.ur10.driver_config import BaseTransformConfig
 from robot.drivers.ur10.rtde_protocol import PoseListener
 from robot.emulators.head.emulator_config import HeadEmulatorConfig
@@ -82,7 +75,7 @@ class SensorArray:
     def skip_block(self) -> None:
         """Skips a block without samples or motion."""
 
-    def receive(self, command: Command, now: float) -> None:
+    def receive(self, command: usb.Command, now: float) -> None:
         """Executes a command."""
 
     def stop(self) -> None:
@@ -127,7 +120,7 @@ class Whiskers(SensorArray):
         if isinstance(self.place, AlongPath):
             self.place.begin(time)
 
-    def receive(self, command: Command, now: float) -> None:
+    def receive(self, command: usb.Command, now: float) -> None:
         self.drives.receive(command, now)
 
     def stop(self) -> None:
@@ -149,7 +142,7 @@ class Whiskers(SensorArray):
         self.pose = None
 
     def block(self, start: float, end: float) -> Block:
-        rate, size = self.config.rate, self.samples
+        config, drives, size = self.config, self.drives, self.samples
         if self.pose is None:
             self.pose, self.lift = self.place.at(start)
         before = self.pose
@@ -159,13 +152,13 @@ class Whiskers(SensorArray):
         begins, parts, done = np.zeros(size, bool), [], 0
         while done < size:
             share = done / size
-            self.balance = self.drives.begin(start + share * (end - start), self.balance)
-            first, left = self.drives.sample, self.drives.samples_left
-            begins[done] = self.drives.whisk is not None and first == 0
+            self.balance = drives.begin(start + share * (end - start), self.balance)
+            first, left = drives.sample, drives.samples_left
+            begins[done] = drives.whisk is not None and first == 0
             count = size - done if left is None else min(size - done, left)
             # Time counts from the start of the whisk, possibly within the block.
-            knots = np.array([first - done, first - done + size]) / rate
-            time = (first + np.arange(count)) / rate
+            knots = np.array([first - done, first - done + size]) / config.rate
+            time = (first + np.arange(count)) / config.rate
             some = noise[:, done : done + count]
             if self.lift < self._clear:
                 # The walls relative to a lifted head are lower by the lift, m.
@@ -176,11 +169,9 @@ class Whiskers(SensorArray):
                 sweep = sweep_walls(self._around, pose, knots, time, some)
             else:
                 sweep = sweep_air(time, some)
-            truth, self.balance = advance_balance(
-                self.config, self.mechanics, self.drives.law, sweep, self.balance
-            )
-            parts.append(sensor_readings(self.config, self.head, truth, sweep.noise, self.baseline))
-            self.drives.sample = 0 if left is None else first + count
+            truth, self.balance = advance_balance(config, self.mechanics, drives.law, sweep, self.balance)
+            parts.append(sensor_readings(config, self.head, truth, sweep.noise, self.baseline))
+            drives.sample = 0 if left is None else first + count
             done += count
         angle, deflection = (np.concatenate([part[k][0] for part in parts]) for k in range(2))
         return Block(angle, deflection, begins, bool((self.balance.drive.most > 0).any()))
@@ -235,21 +226,17 @@ class _ServoDrives:
             return self.whisk.samples - self.sample
         return None if self._from is None else self._retraction - self.sample
 
-    def receive(self, command: Command, time: float) -> None:
+    def receive(self, command: usb.Command, time: float) -> None:
         """Stores a command received at a time, s (the clock of `begin`)."""
         self._command_time = time
-        if command.kind == CommandKind.DRIVE:
+        kind, whisk, fits = command.kind, self.whisk, len(command.numbers) == len(self._centre)
+        if kind == usb.CommandKind.DRIVE:
             self._next = self._make_whisk(command) or self._next
-        elif command.kind == CommandKind.CENTRE and len(command.numbers) == len(self._centre):
-            self._centre = command.numbers * ANGLE
-        elif (
-            command.kind == CommandKind.AMPLITUDES
-            and self.whisk is not None
-            and len(command.numbers) == len(self._centre)
-            and not self.whisk.feedback
-        ):
-            most = self.head.limit - self.whisk.offset
-            self.whisk = self.whisk._replace(amplitude=np.clip(command.numbers * ANGLE, 0.0, most))
+        elif kind == usb.CommandKind.CENTRE and fits:
+            self._centre = command.numbers * usb.ANGLE
+        elif kind == usb.CommandKind.AMPLITUDES and fits and whisk is not None and not whisk.feedback:
+            most = self.head.limit - whisk.offset
+            self.whisk = whisk._replace(amplitude=np.clip(command.numbers * usb.ANGLE, 0.0, most))
 
     def stop(self) -> None:
         """Retracts and discards pending commands."""
@@ -264,7 +251,7 @@ class _ServoDrives:
         Returns:
             state of the whiskers: at rest at the beginning of a cycle.
         """
-        silent = time - self._command_time > COMMAND_TIMEOUT
+        silent = time - self._command_time > usb.COMMAND_TIMEOUT
         self._next = None if silent else self._next
         stop, self._stopped = silent or self._stopped, False
         if self.whisk is not None and stop:
@@ -274,13 +261,11 @@ class _ServoDrives:
                 return balance
             self._from, self.sample = None, 0
             balance = whiskers_at_rest(*balance.before.shape)
-        ended = self.whisk is not None and self.sample >= self.whisk.samples
-        if (self.whisk is None and self._next is not None) or ended:
-            if self._next is not None:
-                self.whisk, self._next = self._next, None
-            assert self.whisk is not None
-            common = np.full(len(self._centre), np.radians(self.whisk.whisking.amplitude_deg))
-            self.whisk, self.sample = self.whisk._replace(amplitude=common), 0
+        ended = self.whisk is None or self.sample >= self.whisk.samples
+        following = self._next or self.whisk
+        if ended and following is not None:
+            common = np.full(len(self._centre), np.radians(following.whisking.amplitude_deg))
+            self.whisk, self._next, self.sample = following._replace(amplitude=common), None, 0
             return whiskers_at_rest(*balance.before.shape)
         return balance
 
@@ -297,12 +282,12 @@ class _ServoDrives:
             aim = np.zeros_like(deflection) + whisk.amplitude * whisk_phase(whisk.whisking, time)
         return aim + whisk.offset if whisk.offset else aim, drive
 
-    def _make_whisk(self, command: Command) -> _Whisk | None:
+    def _make_whisk(self, command: usb.Command) -> _Whisk | None:
         """The whisk of a command; None (no change) if it exceeds the limits of the drives."""
         threshold = np.full(len(self._centre), np.inf)
         numbers = command.numbers[: len(threshold)]
-        threshold[: len(numbers)] = np.where(numbers == NO_THRESHOLD, np.inf, numbers * ANGLE)
-        feedback = command.mode == FeedbackMode.RCP
+        threshold[: len(numbers)] = np.where(numbers == usb.NO_THRESHOLD, np.inf, numbers * usb.ANGLE)
+        feedback = command.mode == usb.FeedbackMode.RCP
         offset = min(max(command.offset, 0.0), self.head.limit)
         amplitude = min(command.amplitude, self.head.limit - offset)
         try:

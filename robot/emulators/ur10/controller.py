@@ -161,9 +161,8 @@ class EmulatedController:
 
     def watch(self, frequency: float, register: int) -> None:
         """Stops the program when a register is written less often than `frequency`, Hz; 0 turns this off."""
-        self._watchdog = (
-            (1 / frequency, register, self.registers.written[register]) if frequency > 0 else None
-        )
+        since = self.registers.written[register]
+        self._watchdog = (1 / frequency, register, since) if frequency > 0 else None
 
     def upload(self, text: str) -> None:
         """Uploads a program, which replaces the running one."""

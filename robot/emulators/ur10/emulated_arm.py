@@ -92,15 +92,17 @@ class _LinearMotion(NamedTuple):
         time = self.time + dt
         done, rate = self.profile.at(time)
         length = self.profile.length or 1.0
-        x, y, z, rx, ry, rz = (done / length * number for number in self.way)
-        start = self.start
-        tcp = (start[0] + x, start[1] + y, start[2] + z, *rotate_by(start, (rx, ry, rz)))
         rest = None if time >= self.profile.duration else self._replace(time=time)
-        return tcp, _scale(self.way, rate / length), rest
+        return _move(self.start, _scale(self.way, done / length)), _scale(self.way, rate / length), rest
 
 
 def _scale(vector: Iterable[float], scale: float) -> Vector6:
     return vector6(x * scale for x in vector)
+
+
+def _move(tcp: Vector6, way: Vector6) -> Vector6:
+    """A tool pose after a translation and a rotation in the base frame."""
+    return (tcp[0] + way[0], tcp[1] + way[1], tcp[2] + way[2], *rotate_by(tcp, way[3:]))
 
 
 class MoveL(NamedTuple):
@@ -116,23 +118,15 @@ class StopL(NamedTuple):
 
     acceleration: float
 
-    def advance(
-        self, state: _MotionState, dt: float, turn_ratio: float
-    ) -> tuple[Vector6, Vector6, StopL | None]:
-        """Slows translation and rotation down; `turn_ratio` (rad/m) relates their decelerations."""
+    def advance(self, state: _MotionState, dt: float, ratio: float) -> tuple[Vector6, Vector6, StopL | None]:
+        """Slows translation and rotation down; `ratio` (rad/m) relates their decelerations."""
         slowed: list[float] = []
         step = self.acceleration * dt
-        for now, most in ((state.speed[:3], step), (state.speed[3:], step * turn_ratio)):
+        for now, most in ((state.speed[:3], step), (state.speed[3:], step * ratio)):
             length = math.hypot(*now)
             slowed += [0.0 if length <= most else v - v * most / length for v in now]
-        x, y, z, rx, ry, rz = speed = vector6(slowed)
-        tcp = (
-            state.tcp[0] + x * dt,
-            state.tcp[1] + y * dt,
-            state.tcp[2] + z * dt,
-            *rotate_by(state.tcp, (rx * dt, ry * dt, rz * dt)),
-        )
-        return tcp, speed, self if any(speed) else None
+        speed = vector6(slowed)
+        return _move(state.tcp, _scale(speed, dt)), speed, self if any(speed) else None
 
 
 MoveOrder = MoveL | StopL
@@ -148,9 +142,8 @@ def parse_moves(text: str) -> list[MoveL]:
     for match in filter(None, map(_MOVE.match, text.splitlines())):
         with contextlib.suppress(ValueError):  # not numbers: the line is ignored
             goal = vector6(map(float, match["pose"].split(",")))
-            limits = {"a": 1.2, "v": 0.25} | {
-                name: float(value) for name, value in _LIMIT.findall(match["limits"])
-            }
+            given = {name: float(value) for name, value in _LIMIT.findall(match["limits"])}
+            limits = {"a": 1.2, "v": 0.25} | given
             moves.append(MoveL(goal, limits["v"], limits["a"]))
     return moves
 
@@ -194,8 +187,7 @@ class EmulatedArm:
     def place(self, tcp: Vector6) -> None:
         """Sets the tool pose [6] (m, rotation vector rad) at once. Raises `Unreachable`."""
         self.state = _MotionState(tcp, ZERO, self.solve(tcp), ZERO)
-        self._motion, self._order = None, None
-        self._queue.clear()
+        self.order(())
         self._update_force()
 
     def set_tool(self, tool: Vector6) -> None:
@@ -230,10 +222,9 @@ class EmulatedArm:
                 self._order = self._queue.popleft()
                 self._motion = self._start(self._order)
             if self._motion is not None:
-                self._advance(dt)
+                self._advance(self._motion, dt)
         except Unreachable:
-            self._motion, self._order = None, None
-            self._queue.clear()
+            self.order(())
             self._rest()
             raise
         self._update_force()
@@ -257,9 +248,7 @@ class EmulatedArm:
         slower = max(straight, turning, key=lambda profile: profile.duration)
         return _LinearMotion(state.tcp, way, slower) if slower.length > 0 else None
 
-    def _advance(self, dt: float) -> None:
-        motion, joints = self._motion, self.state.joints
-        assert motion is not None
+    def _advance(self, motion: _LinearMotion | StopL, dt: float) -> None:
         scale = 1.0 if isinstance(motion, StopL) else self.scale
         if scale <= 0:
             self._rest()
@@ -269,10 +258,9 @@ class EmulatedArm:
         else:
             tcp, speed, self._motion = motion.advance(dt * scale)
         after = self.solve(tcp)
-        rate = _scale((new - old for new, old in zip(after, joints, strict=True)), 1 / (dt * scale))
-        if scale != 1.0:
-            speed, rate = _scale(speed, scale), _scale(rate, scale)
-        self.state = _MotionState(tcp, speed, after, rate)
+        turned = (new - old for new, old in zip(after, self.state.joints, strict=True))
+        rate = _scale(turned, 1 / (dt * scale))
+        self.state = _MotionState(tcp, _scale(speed, scale), after, _scale(rate, scale))
         if self._motion is None:
             self._order = None
             self._rest()

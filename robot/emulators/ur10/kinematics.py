@@ -71,12 +71,8 @@ def _matrix(rotation: Quaternion) -> Matrix:
 def _rotate(rotation: Quaternion, vector: Sequence[float]) -> Vector3:
     """The vector [3] after the rotation."""
     x, y, z = vector
-    first, second, third = _matrix(rotation)
-    return (
-        first[0] * x + first[1] * y + first[2] * z,
-        second[0] * x + second[1] * y + second[2] * z,
-        third[0] * x + third[1] * y + third[2] * z,
-    )
+    first, second, third = (a * x + b * y + c * z for a, b, c in _matrix(rotation))
+    return first, second, third
 
 
 def compose_poses(frame: Sequence[float], pose: Sequence[float]) -> Vector6:

@@ -242,10 +242,8 @@ class DashboardSession(_LineSession):
             "polyscopeversion": "URSoftware {}.{}.{}.0 (emulated)".format(*controller.config.version),
         }
         if controller.config.version >= (5, 6):
-            answers |= {
-                "is in remote control": str(controller.remote).lower(),
-                "get serial number": "20163000000",
-            }
+            answers["is in remote control"] = str(controller.remote).lower()
+            answers["get serial number"] = "20163000000"
         return answers.get(name, f"could not understand: '{command}'")
 
 
@@ -341,11 +339,8 @@ class RtdeSession:
 
     def _set_inputs(self, body: bytes) -> bytes:
         names = _split(body)
-        types = [rtde_protocol.INPUT_TYPES.get(name, "NOT_FOUND") for name in names]
-        types = [
-            kind if self._claims.free(name, self) else "IN_USE"
-            for name, kind in zip(names, types, strict=True)
-        ]
+        known, free = rtde_protocol.INPUT_TYPES, self._claims.free
+        types = [known.get(name, "NOT_FOUND") if free(name, self) else "IN_USE" for name in names]
         if "NOT_FOUND" in types or "IN_USE" in types:
             return b"\0" + ",".join(types).encode()
         for name in names:
@@ -492,12 +487,8 @@ class _ControllerFaults:
         for axis in set("xyz") & set(request):
             at = float(request[axis])
             beyond = 1 if arm.state.tcp["xyz".index(axis)] <= at else -1
-            arm.walls.append(
-                WallConfig.model_validate(
-                    {"axis": axis, "at": at, "solid": request.get("solid", beyond)}
-                    | {key: request[key] for key in ("stiffness",) if key in request}
-                )
-            )
+            given = {key: request[key] for key in ("solid", "stiffness") if key in request}
+            arm.walls.append(WallConfig.model_validate({"axis": axis, "at": at, "solid": beyond} | given))
 
     def _clear(self) -> None:
         self._active.clear()

@@ -7,6 +7,7 @@ behaviour, wheels, strain), so that changing one part leaves the others unchange
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -86,7 +87,7 @@ class CreateSimulation(SimulatedSource):
         self.config = config
         self.arena = make_arena(config.arena, config.seed)
         walls, noise = wall_segments(self.arena), stream(config.seed, "strain")
-        robot = _CreateRobot(config.behaviour, config.whiskers, walls, noise)
+        robot = _CreateRobot(config, walls, noise)
         self.whiskers = len(robot.whiskers.base)
         start, random = robot.at(self.arena.start), stream(config.seed, "behaviour")
         self.steps: list[_CreateStep] = []
@@ -155,19 +156,17 @@ def drive_into_wall(config: CreateSimulationConfig, angle: float, random: np.ran
     room += APPROACH * random.uniform(0.5, 1.0) * towards[0]
     along = HALF_WALL * np.array([np.cos(angle), np.sin(angle)])
     wall = np.concatenate([room * towards - along, room * towards + along])[None]
-    robot = _CreateRobot(behaviour, whiskers, wall, random)
+    robot = _CreateRobot(config, wall, random)
     step = robot.at(np.zeros(3))
     while step.moment == StepEnd.FREE and step.pose[0] < 2 * APPROACH + whiskers.length:
         step = robot.step(step, CreateState.FWD1, WheelCommand(behaviour.fast, 0.0, behaviour.step))
     if step.moment != StepEnd.HIT1:
-        found = (
-            f"no contact at a strain of {behaviour.contact:g} with a wall at {np.degrees(angle):.0f} degrees"
-        )
+        wall_text = f"a wall at {np.degrees(angle):.0f} degrees"
+        found = f"no contact at a strain of {behaviour.contact:g} with {wall_text}"
         expected = "a lower strain, or whiskers that reach beyond the body"
         raise InputError("create_simulation.behaviour.contact", found, expected)
-    patient = behaviour.model_copy(update={"safety": np.inf, "least": RECORD_TIME})
-    command = WheelCommand(behaviour.slow, 0.0, RECORD_TIME)
-    push = _CreateRobot(patient, whiskers, wall, random).step(step, CreateState.FWD2, command)
+    robot.behaviour = behaviour.model_copy(update={"safety": np.inf, "least": RECORD_TIME})
+    push = robot.step(step, CreateState.FWD2, WheelCommand(behaviour.slow, 0.0, RECORD_TIME))
     return make_report(config, push, Odometry(behaviour.slow * RECORD_TIME, 0.0, 0.0, RECORD_TIME))
 
 
@@ -188,14 +187,9 @@ def train_strain_templates(config: CreateSimulationConfig) -> StrainTemplates:
     """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G)."""
     training = TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
     random = stream(config.seed, "templates")
-    return train_templates(
-        (
-            TrainingDrive.of_report(angle, repeat, drive_into_wall(config, angle, random))
-            for angle in training.angles.tolist()
-            for repeat in range(training.repeats)
-        ),
-        training,
-    )
+    each = product(training.angles.tolist(), range(training.repeats))
+    drives = (TrainingDrive.of_report(at, k, drive_into_wall(config, at, random)) for at, k in each)
+    return train_templates(drives, training)
 
 
 MIN_DURATION = 1e-6
@@ -228,15 +222,10 @@ class _CreateRobot:
     """
 
     def __init__(
-        self,
-        behaviour: BehaviourConfig,
-        whiskers: WhiskersConfig,
-        walls: np.ndarray,
-        random: np.random.Generator,
+        self, config: CreateSimulationConfig, walls: np.ndarray, random: np.random.Generator
     ) -> None:
-        self.behaviour, self.sensors, self.walls = behaviour, whiskers, walls
-        self.whiskers = fixed_whiskers(whiskers)
-        self._random = random
+        self.behaviour, self.sensors, self.walls = config.behaviour, config.whiskers, walls
+        self.whiskers, self._random = fixed_whiskers(config.whiskers), random
 
     def at(self, pose: np.ndarray) -> _CreateStep:
         """The state before the first motion from a pose."""

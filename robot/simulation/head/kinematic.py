@@ -14,9 +14,11 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from robot.simulation.head.baseline import BaselineConfig
 from robot.simulation.head.beam import StreamConfig
+from robot.sources.in_memory import NO_ODOMETRY
 from robot.world.scene import HeadPath, poses_at
 from robot.world.walls import Surroundings
 from tactile.base.settings import Settings
+from tactile.base.types import Whisk
 from tactile.contact_threshold import ShaftConfig, stiffness
 from tactile.whisker_geometry import Head
 from tactile.whisking import WhiskingConfig, neighbour_max, whisk_phase
@@ -63,25 +65,15 @@ class HeadSetup(NamedTuple):
     whisking: WhiskingConfig
 
 
-class WhiskColumns(NamedTuple):
-    """Contact features of all cycles: the columns [N, W] of `Whisk`."""
-
-    contact: np.ndarray
-    touched: np.ndarray
-    held: np.ndarray
-    highest: np.ndarray
-    reach: np.ndarray
-
-
 def simulate_kinematic(
     setup: HeadSetup,
     surroundings: Surroundings,
     path: HeadPath,
     start: np.ndarray,
     random: np.random.Generator,
-) -> WhiskColumns:
-    """Contact features of whisk cycles that start at times [N] s along a path, with noise and faults of the
-    sensors."""
+) -> Whisk:
+    """Contact features [N, W] of whisk cycles that start at times [N] s along a path, with noise and faults
+    of the sensors; without odometry, and with one `alive` [W]."""
     features = _touch_walls(setup, surroundings, path, start)
     config, shape, alive = setup.mechanics, features.contact.shape, setup.head.alive
     missed = random.random(shape) < config.missed
@@ -93,7 +85,9 @@ def simulate_kinematic(
     contact = ((features.contact & ~missed) | spurious) & alive
     touched = np.where(spurious, anywhere, features.touched)
     highest = np.where(spurious, anywhere, features.highest + noise[1])
-    return WhiskColumns(
+    return Whisk(
+        odometry=NO_ODOMETRY,
+        alive=alive,
         contact=contact,
         touched=np.where(contact, touched + noise[0], 0.0),
         held=((features.held & ~missed) | spurious) & alive,
@@ -102,9 +96,7 @@ def simulate_kinematic(
     )
 
 
-def _touch_walls(
-    setup: HeadSetup, surroundings: Surroundings, path: HeadPath, start: np.ndarray
-) -> WhiskColumns:
+def _touch_walls(setup: HeadSetup, surroundings: Surroundings, path: HeadPath, start: np.ndarray) -> Whisk:
     """Contacts [N, W] with the walls, and how they bend and turn the whiskers, without noise.
 
     A whisker touched near its base is stiffer: it bends less and its sensor reads more.
@@ -145,7 +137,7 @@ def _touch_walls(
     held = noticed & there & (bend <= config.slip) & (hard_last * bend > config.dead_zone)
     highest = np.where(held, last + bend, amplitude - taken)
     touched = np.where(noticed, touched + config.dead_zone, 0.0)
-    return WhiskColumns(noticed, touched, held, highest, reach)
+    return Whisk(NO_ODOMETRY, head.alive, noticed, touched, held, highest, reach)
 
 
 def _apply_feedback(setup: HeadSetup, reading: np.ndarray, push: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -23,9 +23,10 @@ from scipy.linalg import expm
 
 from robot.simulation.head.baseline import make_baseline
 from robot.simulation.head.beam import Beam, StreamConfig, make_beam
-from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns, simulate_kinematic
+from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, simulate_kinematic
 from robot.simulation.head.odometry_errors import OdometryConfig, simulate_odometry
 from robot.simulation.head.whisk_stream import (
+    TrueSamples,
     WallSweep,
     simulate_cycles,
     simulate_free_cycles,
@@ -63,9 +64,7 @@ WALL_STIFFNESS = 300.0
 """Ratio of wall stiffness to whisker stiffness."""
 
 
-def simulate_dynamic(
-    setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulate_dynamic(setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray) -> TrueSamples:
     """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.MechanicsModel`."""
     head, config, mechanics, whisking = setup
     model = make_beam(config.beam.shaft)
@@ -248,19 +247,17 @@ class HeadSimulation(SimulatedSource):
             change = int(config.later_maze * count)
             other = other_surroundings(self.scene, config.maze, head, seed)
             self._parts = [(self.scene.surroundings, slice(change)), (other, slice(change, None))]
-        mechanics = config.mechanics
-        self._baseline = make_baseline(
-            mechanics.baseline, mechanics.noise, config.stream.rate, self.whiskers, seed
-        )
+        mechanics, rate = config.mechanics, config.stream.rate
+        self._baseline = make_baseline(mechanics.baseline, mechanics.noise, rate, self.whiskers, seed)
         self.calibration, self.features = None, None
         if self.tier == "kinematic":
             parts = []
             for surroundings, cycles in self._parts:
                 random = stream(seed, "sensor")  # noise of the whole session, independent of the maze
                 columns = simulate_kinematic(self._setup, surroundings, self.scene.path, self.start, random)
-                parts.append([column[cycles] for column in columns])
+                parts.append([column[cycles] for column in columns[2:]])
             features = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-            self.features = WhiskColumns(*features)
+            self.features = Whisk(NO_ODOMETRY, head.alive, *features)
         else:  # free whisking before the session
             whisks = int(np.ceil(config.calibration.min_duration * whisking.rate))
             random, model = stream(seed, "calibration"), RAW_TIERS[self.tier]
@@ -276,22 +273,19 @@ class HeadSimulation(SimulatedSource):
             cell_size=POSE_CELL_SIZE,
             head=head_config,
             calibration=self.calibration,
-            maze=maze_info(self.scene.maze, config.maze, config.seed),
-            simulation=SimulationInfo(
-                sha256=self.digest, seed=config.seed, tier=self.tier, why=self.tier_reason
-            ),
+            maze=maze_info(self.scene.maze, config.maze, seed),
+            simulation=SimulationInfo(sha256=self.digest, seed=seed, tier=self.tier, why=self.tier_reason),
             provenance={"simulation": plain},
         )
 
     def _readings(self) -> Iterator[Whisk | Cycle]:
         if self.features is not None:
-            yield from (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in zip(*self.features, strict=True))
+            features = zip(*self.features[2:], strict=True)
+            yield from (Whisk(NO_ODOMETRY, self.head.alive, *row) for row in features)
             return
         assert self.calibration is not None
         random, baseline = stream(self.config.seed, "sensor"), deepcopy(self._baseline)
         model, threshold = RAW_TIERS[self.tier], self.calibration.threshold[:, 1]
-        for surroundings, rows in self._parts:
+        for walls, rows in self._parts:
             path, start = self.scene.path, self.start[rows]
-            yield from simulate_cycles(
-                model, self._setup, surroundings, path, start, random, threshold, baseline
-            )
+            yield from simulate_cycles(model, self._setup, walls, path, start, random, threshold, baseline)

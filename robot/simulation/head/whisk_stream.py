@@ -45,15 +45,17 @@ class WallSweep(NamedTuple):
     noise: np.ndarray
 
 
-MechanicsModel = Callable[[HeadSetup, WallSweep, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""A model of the mechanics: true angle, x and y of every sample, [T, N, W] rad, of a sweep, with contact
-thresholds [W] of y, rad. Its whisking law reads y with noise."""
+TrueSamples = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""True angle, x and y of every sample, [T, N, W] rad."""
+MechanicsModel = Callable[[HeadSetup, WallSweep, np.ndarray], TrueSamples]
+"""A model of the mechanics: the samples of a sweep, with contact thresholds [W] of y, rad. Its whisking law
+reads y with noise."""
 
 
 def simulate_cycles(
     tier: MechanicsModel,
     setup: HeadSetup,
-    surroundings: Surroundings,
+    surroundings: Surroundings | None,
     path: HeadPath,
     start: np.ndarray,
     random: np.random.Generator,
@@ -63,15 +65,23 @@ def simulate_cycles(
     """Raw cycles that start at times [N] s along a path, without odometry and each with whiskers at rest.
 
     Args:
-        threshold: [W] contact threshold of y from a calibration, rad. baseline: coloured noise, drift and
-            creep of the deflections, which go on from its state; None: none.
+        surroundings: the walls; None: free air. threshold: [W] contact threshold of y from a calibration,
+            rad. baseline: coloured noise, drift and creep of the deflections, which go on from its state;
+            None: none.
     """
-    knots = np.linspace(0.0, 1 / setup.whisking.rate, setup.config.poses + 1)
-
-    def sweep(begins: np.ndarray, time: np.ndarray, noise: np.ndarray) -> WallSweep:
-        return sweep_walls(surroundings, poses_at(path, begins[:, None] + knots), knots, time, noise)
-
-    return _simulate(tier, setup, sweep, start, random, threshold, baseline)
+    head, config, mechanics, whisking = setup
+    knots = np.linspace(0.0, 1 / whisking.rate, config.poses + 1)
+    time = np.arange(round(config.rate / whisking.rate)) / config.rate
+    for k in range(0, len(start), config.batch):
+        begins = start[k : k + config.batch]
+        noise = draw_noise(mechanics, (len(begins), len(time), len(head.length)), random, baseline)
+        if surroundings is None:
+            sweep = sweep_air(time, noise)
+        else:
+            sweep = sweep_walls(surroundings, poses_at(path, begins[:, None] + knots), knots, time, noise)
+        samples = sensor_readings(config, head, tier(setup, sweep, threshold), noise, baseline)
+        for begin, angle, deflection in zip(begins, *samples, strict=True):
+            yield Cycle(begin + time, angle, deflection, NO_ODOMETRY)
 
 
 def simulate_free_cycles(
@@ -88,32 +98,8 @@ def simulate_free_cycles(
     """
     setup = setup._replace(whisking=setup.whisking.model_copy(update={"mode": "open"}))
     start, threshold = np.arange(count) / setup.whisking.rate, np.full(len(setup.head.length), np.inf)
-
-    def sweep(begins: np.ndarray, time: np.ndarray, noise: np.ndarray) -> WallSweep:
-        return sweep_air(time, noise)
-
-    return list(_simulate(tier, setup, sweep, start, random, threshold, baseline))
-
-
-def _simulate(
-    tier: MechanicsModel,
-    setup: HeadSetup,
-    sweep: Callable[[np.ndarray, np.ndarray, np.ndarray], WallSweep],
-    start: np.ndarray,
-    random: np.random.Generator,
-    threshold: np.ndarray,
-    baseline: Baseline | None,
-) -> Iterator[Cycle]:
-    """Cycles that start at times [N] s, batch by batch; `sweep` takes starts, sample times and noise."""
-    head, config, mechanics, whisking = setup
-    time = np.arange(round(config.rate / whisking.rate)) / config.rate
-    for k in range(0, len(start), config.batch):
-        begins = start[k : k + config.batch]
-        noise = draw_noise(mechanics, (len(begins), len(time), len(head.length)), random, baseline)
-        truth = tier(setup, sweep(begins, time, noise), threshold)
-        samples = sensor_readings(config, head, truth, noise, baseline)
-        for begin, angle, deflection in zip(begins, *samples, strict=True):
-            yield Cycle(begin + time, angle, deflection, NO_ODOMETRY)
+    still = HeadPath(start, np.zeros((count, 3)))
+    return list(simulate_cycles(tier, setup, None, still, start, random, threshold, baseline))
 
 
 def draw_noise(
@@ -134,11 +120,7 @@ def draw_noise(
 
 
 def sensor_readings(
-    config: StreamConfig,
-    head: Head,
-    truth: tuple[np.ndarray, np.ndarray, np.ndarray],
-    noise: np.ndarray,
-    baseline: Baseline | None,
+    config: StreamConfig, head: Head, truth: TrueSamples, noise: np.ndarray, baseline: Baseline | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sensor readings for true values of a model: angles [N, T, W] and deflections [N, T, W, 2], rad.
 
@@ -232,7 +214,7 @@ def advance_balance(
     law: WhiskingLaw,
     sweep: WallSweep,
     balance: WhiskerBalance,
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], WhiskerBalance]:
+) -> tuple[TrueSamples, WhiskerBalance]:
     """The samples of a sweep, which may be any part of a cycle, continuing from a state.
 
     Returns:
@@ -264,9 +246,7 @@ def advance_balance(
     return (angle, hard * aside, hard * bent), after
 
 
-def simulate_quasistatic(
-    setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulate_quasistatic(setup: HeadSetup, sweep: WallSweep, threshold: np.ndarray) -> TrueSamples:
     """Angle, x and y, [T, N, W] rad: a `robot.simulation.head.whisk_stream.MechanicsModel`."""
     head, config, mechanics, whisking = setup
 

@@ -131,11 +131,7 @@ def _kidnap(
 ) -> None:
     """Moves the rows of the path from each kidnap on, in the order of their times."""
     rows = len(timeline.source)
-    kidnaps = [
-        (phase.start, phase.kidnap, f"{KEY}.{number}.kidnap")
-        for number, phase in enumerate(phases)
-        if phase.kidnap is not None
-    ]
+    kidnaps = [(p.start, p.kidnap, f"{KEY}.{k}.kidnap") for k, p in enumerate(phases) if p.kidnap is not None]
     for start, place, key in sorted(kidnaps):
         row = _first_row(start, rate_hz)
         left = rows - row

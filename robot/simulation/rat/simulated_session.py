@@ -270,20 +270,14 @@ class RatSimulation(SimulatedSource):
         here = _scale_poses(pose[source], scale)
         before = _scale_poses(pose[np.maximum(source - 1, 0)], scale)
         self.truth = wrap_headings(here)
-        motion = np.column_stack(
-            [between(before, here)[:, :2], here[:, 2] - before[:, 2], np.full(rows, 1.0)]
-        )
-        motion[:, 3] /= config.rate_hz
+        step = np.full(rows, 1 / config.rate_hz)
+        motion = np.column_stack([between(before, here)[:, :2], here[:, 2] - before[:, 2], step])
         motion[0] = 0.0
         self.odometry = measure_motion(config.odometry, motion, config.seed)
         # The timeline has the numbers of these boxes.
         self._boxes = [config.box, *(phase.box for phase in config.phases if phase.box is not None)]
-        sizes = [(box.width, box.height) for box in self._boxes]
-        sizes += [
-            (config.box.width * phase.stretch[0], config.box.height * phase.stretch[1])
-            for phase in config.phases
-            if phase.stretch is not None
-        ]
+        sizes = [np.array([box.width, box.height]) for box in self._boxes]
+        sizes += [np.multiply(sizes[0], phase.stretch) for phase in config.phases if phase.stretch]
         width, height = np.max(sizes, axis=0).tolist()
         settings = config.model_dump(mode="json", exclude={"path": {"file"}})
         self.info = SourceInfo(

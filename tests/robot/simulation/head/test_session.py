@@ -58,7 +58,7 @@ def test_streams_are_independent() -> None:
     base = simulate()
     other = simulate(odometry={"noise": "white"})
     assert (base.odometry != other.odometry).any()
-    assert all((one == two).all() for one, two in zip(base.features, other.features, strict=True))
+    assert all((one == two).all() for one, two in zip(base.features[1:], other.features[1:], strict=True))
     noisy = simulate(mechanics={"noise": 5e-3})
     assert (noisy.odometry == base.odometry).all()
     assert (noisy.features.touched != base.features.touched).any()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robot.simulation.head.beam import StreamConfig, make_beam
-from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig, WhiskColumns
+from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig
 from robot.simulation.head.simulated_session import simulate_dynamic
 from robot.simulation.head.whisk_stream import (
     MechanicsModel,
@@ -19,7 +19,7 @@ from robot.world.scene import HeadPath, MotionConfig, plan_path
 from robot.world.walls import Surroundings, Walls
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.base.types import Cycle
+from tactile.base.types import Cycle, Whisk
 from tactile.calibration import Calibration, CalibrationConfig, calibrate
 from tactile.contact_threshold import ContactConfig, ShaftConfig, detect_contacts, stiffness
 from tactile.whisker_geometry import HeadConfig, ur10_head
@@ -76,16 +76,14 @@ def maze(count: int) -> tuple[Surroundings, HeadPath, np.ndarray]:
 
 def detected_contacts(
     tier: MechanicsModel, count: int, whisking: WhiskingConfig, rate: float = 2000.0
-) -> WhiskColumns:
+) -> Whisk:
     config = StreamConfig(rate=rate)
     there, path, start = maze(count)
     known = calibration(tier, config=config)
     setup = HeadSetup(HEAD, config, MECHANICS, whisking)
     raw = simulate_cycles(tier, setup, there, path, start, stream(1, "sensor"), known.threshold[:, 1])
     whisks = [detect_contacts(ContactConfig(), known, cycle) for cycle in raw]
-    return WhiskColumns(
-        *(np.array([getattr(whisk, name) for whisk in whisks]) for name in WhiskColumns._fields)
-    )
+    return Whisk(*(np.array(column) for column in zip(*whisks, strict=True)))
 
 
 @pytest.mark.parametrize("taper", [0.1, 0.2, 0.6])
