@@ -299,8 +299,7 @@ def _draw_lesions(result: _Lesions, png: Path) -> None:
         inside = axes[0][0].get_yaxis_transform()
         axes[0][0].text(0.02, y, lesion, transform=inside, va="center", fontsize=7, color=style.INK)
     axes[0][1].set_xscale("log")
-    style.add_legend(figure, axes[0][0])
-    figure.savefig(png)
+    style.add_legend(figure, axes[0][0]).savefig(png)
 
 
 CELL, SIDE = 0.05, 21
@@ -423,8 +422,7 @@ def _draw_sizes(result: _Sizes, png: Path) -> None:
         panel.set_ylim(bottom=0)
         style.name_axes(panel, across, "revisits closed")
     axes[0][1].set_xscale("log")
-    style.add_legend(figure, axes[0][0])
-    figure.savefig(png)
+    style.add_legend(figure, axes[0][0]).savefig(png)
 
 
 LESIONS_FIGURE = Figure("Lesions of the belief network", measure_lesions, _table_lesions, _draw_lesions)

@@ -181,8 +181,7 @@ def _draw_posterior(result: tuple[_Scores, str], png: Path) -> None:
     axes[0][1].plot([40, 100], [40, 100], "--", color=style.GREY, lw=0.9)
     across, up = "probability of the region (%)", "updates with the truth in it (%)"
     name_panel(axes[0][1], "truth in the region", across, up)
-    style.add_legend(figure, axes[0][1], columns=3)
-    figure.savefig(png)
+    style.add_legend(figure, axes[0][1], columns=3).savefig(png)
 
 
 DIFFERENCE = 24
@@ -388,8 +387,7 @@ def _draw_kidnaps(result: _Kidnaps, png: Path) -> None:
     left.axvline(0, color=style.GREY, ls="--", lw=0.9)
     name_panel(left, "novelty, median", "updates since the kidnap", "novelty")
     name_panel(right, "found again", "updates since the kidnap", "share of kidnaps")
-    style.add_legend(figure, right, columns=2)
-    figure.savefig(png)
+    style.add_legend(figure, right, columns=2).savefig(png)
 
 
 HEADINGS, WIDTH = 72, 20.0
@@ -476,8 +474,7 @@ def _draw_conflicts(result: _Weights, png: Path) -> None:
             panel.plot(ANGLES, weights, mark, color=COLOURS[name], lw=1.6, ms=5, label=name)
         panel.set_ylim(-0.02, 1.02)
         name_panel(panel, case, "degrees apart", "weight")
-    style.add_legend(figure, axes[0][0])
-    figure.savefig(png)
+    style.add_legend(figure, axes[0][0]).savefig(png)
 
 
 POSTERIOR_FIGURE = Figure(

@@ -307,8 +307,7 @@ def _draw_boxes(result: _Boxes, png: Path) -> None:
         fontsize=7.5, color=style.LABEL_GREY,
     )  # fmt: skip
     axes = _draw_histograms(figure, pairs)
-    style.add_legend(figure, axes, columns=3)
-    figure.savefig(png)
+    style.add_legend(figure, axes, columns=3).savefig(png)
 
 
 def _draw_histograms(figure: style.Figure, pairs: Mapping[str, Mapping[str, np.ndarray]]) -> style.Axes:

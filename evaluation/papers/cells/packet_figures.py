@@ -127,8 +127,7 @@ def _draw_drift(result: _Drift, png: Path) -> None:
             panel.plot([], [], "--", color=style.INK, lw=0.9, label="odometry (control)")
             panel.set_ylim(0, max(panel.get_ylim()[1], LEAST))
             name_panel(panel, "" if quantity else title, across, up)
-    style.add_legend(figure, axes[0][0], columns=6)
-    figure.savefig(png)
+    style.add_legend(figure, axes[0][0], columns=6).savefig(png)
 
 
 def _errors_of(seed: int, times: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -298,8 +297,7 @@ def _draw_anchoring(result: _Anchoring, png: Path) -> None:
             panel.set_ylim(bottom=0)
             title = "path of a real rat" if path == "sargolini" else "random walk"
             name_panel(panel, "" if quantity else title, "time (s)", up)
-    style.add_legend(figure, axes[0][0])
-    figure.savefig(png)
+    style.add_legend(figure, axes[0][0]).savefig(png)
 
 
 def _draw_curve(axes: style.Axes, error: np.ndarray, test: str) -> None:

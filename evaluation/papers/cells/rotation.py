@@ -182,8 +182,7 @@ def _draw_rotation(result: _Rotations, png: Path) -> None:
     right.set_xlim(turned_at / 2, end)
     right.legend(frameon=False, fontsize=8, labelcolor=style.INK, loc="upper left")
     name_panel(right, "heading of the packet over time, median", "time (s)", "rotation (deg)")
-    style.add_legend(figure, left, columns=5)
-    figure.savefig(png)
+    style.add_legend(figure, left, columns=5).savefig(png)
 
 
 def _spread(values: np.ndarray, digits: int) -> str:

@@ -204,8 +204,7 @@ def _draw_torus(result: _Torus, png: Path) -> None:
             top -= tall
             _draw_row(figure, top, tall, images, extent, colours)
     axes = _draw_histograms(figure, scores, large.spacing, torus)
-    style.add_legend(figure, axes, columns=2)
-    figure.savefig(png)
+    style.add_legend(figure, axes, columns=2).savefig(png)
 
 
 def _ratio(found: _LatticeFigures, torus: float) -> str:

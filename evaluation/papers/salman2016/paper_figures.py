@@ -38,8 +38,7 @@ def draw_drift(
             axes.plot(*odometry[rows].T, "-", lw=1.2, color=VERMILLION, alpha=shade, label=label)
         axes.plot(*truth[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
         _map_axes(axes)
-    style.add_legend(figure, panels[0])
-    return figure
+    return style.add_legend(figure, panels[0])
 
 
 def draw_experiences(
@@ -75,8 +74,7 @@ def draw_experiences(
                       mew=0.9 if mark == "x" else 0, color=color, label=label)  # fmt: skip
         axes.axvline(base - 0.5, color=INK, lw=1.1, ls=_DOTS, label="end of the base set")
         style.name_axes(axes, "step", "experience")
-    style.add_legend(figure, panels[0], columns=3)
-    return figure
+    return style.add_legend(figure, panels[0], columns=3)
 
 
 def draw_measured(
@@ -117,8 +115,7 @@ def draw_measured(
             axes.set_ylim(bottom=0)
         axes.grid(False, axis="x")
     fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
-    style.add_legend(figure, fullest)
-    return figure
+    return style.add_legend(figure, fullest)
 
 
 def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> style.Figure:
@@ -134,8 +131,7 @@ def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, 
             part = np.where(rows[:, None], position, np.nan)
             axes.plot(*part.T, "-", lw=1.0, alpha=0.7, color=color, label=label)
         _map_axes(axes)
-    style.add_legend(figure, panels[0])
-    return figure
+    return style.add_legend(figure, panels[0])
 
 
 def draw_curves(
@@ -153,8 +149,7 @@ def draw_curves(
                 axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
         axes.set(xlim=(-0.04, 1.04), ylim=(0, None))
         style.name_axes(axes, "ARCR, strict", "ARR")
-    style.add_legend(figure, panels[0])
-    return figure
+    return style.add_legend(figure, panels[0])
 
 
 def draw_tuning(
@@ -186,8 +181,7 @@ def draw_tuning(
         if winner is not None:
             axes.axvline(winner, color=INK, lw=1.1, ls=_DOTS, label="chosen")
     right.legend(frameon=False, fontsize=9, labelcolor=INK)
-    style.add_legend(figure, left)
-    return figure
+    return style.add_legend(figure, left)
 
 
 def _panels(
