@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import networkx
 import numpy as np
 
-from evaluation.papers.tables.touch_table import KIDNAPS, MAIN
+from evaluation.papers.tables.touch_table import KIDNAPS, MAIN, touch_config
 from evaluation.papers.trial_sessions import collect_session
 from ratslam.runs.build_session import open_observations
 from ratslam.runs.settings.run_config import RunConfig
@@ -71,17 +71,6 @@ def record(recipe: Recipe) -> Recorded:
         if log.truth is None:
             raise InputError(log.name, "no true poses", "a recording with truth")
     return Recorded(config, cut_log(log, recipe.first, recipe.last))
-
-
-def touch_config(maze: int, seed: int, settings: dict[str, Any], keyframes: dict[str, Any]) -> RunConfig:
-    """The configuration of a whisker session.
-
-    Args:
-        maze: seed of the maze. seed: of everything else. settings: further ones of `simulation`; those of
-            `maze` are added to its seed. keyframes: settings of the map.
-    """
-    parts = settings | {"seed": seed, "maze": {"seed": maze} | settings.get("maze", {})}
-    return RunConfig.model_validate({"simulation": parts, "keyframes": keyframes, "backend": "recall"})
 
 
 LOCALISED = 120
@@ -205,7 +194,7 @@ def open_world(maze: int) -> tuple[Maze, list[Cell]]:
 
 def ten_circuits(maze: int) -> Recipe:
     """The session that makes the map: that of the row `main` of the touch table."""
-    return Recipe(touch_config(maze, maze % 100, MAIN, {}))
+    return Recipe(touch_config(maze, maze % 100, MAIN))
 
 
 def unknown_start(maze: int, whisks: int = LOCALISED, name: str = "start") -> Recipe:
@@ -309,13 +298,13 @@ def closed_door(maze: int) -> tuple[Recipe, np.ndarray]:
 
 def kidnapped(maze: int) -> Recipe:
     """Ten circuits with eight kidnaps: the row `kidnaps` of the touch table."""
-    return Recipe(touch_config(maze, maze % 100, KIDNAPS, {"may_be_carried": True}))
+    return Recipe(touch_config(maze, maze % 100, KIDNAPS, keyframes={"may_be_carried": True}))
 
 
 def _later(maze: int, name: str, settings: dict[str, Any]) -> RunConfig:
     """The configuration of a further session of the maze; those of different names are independent."""
     seed = int(stream(maze, f"atlas.{name}").integers(1 << 31))
-    return touch_config(maze, seed, MAIN | settings, {})
+    return touch_config(maze, seed, MAIN | settings)
 
 
 def _explore_all(seed: int, maze: Maze, name: str, cells: tuple[Cell, ...], steps: int) -> Recipe:

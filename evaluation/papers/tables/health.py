@@ -24,7 +24,7 @@ from evaluation.papers.tables.buildings import HARM_FACTOR, HARM_MARGIN
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import Recording, real_recordings
 from evaluation.papers.tables.spoilt_maps import spoilt_maps
-from evaluation.papers.tables.touch_table import MAIN, NOISE, ROWS
+from evaluation.papers.tables.touch_table import MAIN, NOISE, ROWS, touch_config
 from evaluation.papers.trial_sessions import run_recording
 from evaluation.studies.executor import run_tasks
 from evaluation.studies.perturbation import miscalibrate
@@ -118,11 +118,7 @@ def _judge_session(task: tuple[str, int]) -> np.ndarray:
 def task_config(row: str, number: int) -> tuple[RunConfig, bool]:
     """The configuration of a session, and whether it is a whisker session."""
     if row in TOUCH:
-        maze = FIRST_MAZE + number
-        simulation = TOUCH[row]
-        simulation = simulation | {"seed": number, "maze": {"seed": maze} | simulation.get("maze", {})}
-        parts = {"simulation": simulation, "session": {"reserve": 2048}}
-        return RunConfig.model_validate(parts), True
+        return touch_config(FIRST_MAZE + number, number, TOUCH[row], session={"reserve": 2048}), True
     config, file = REAL[row]
     settings = (f"recording.file={(real_recordings() or Path()).absolute() / file}",) if file else ()
     recording = Recording(row, config, settings, real=True)

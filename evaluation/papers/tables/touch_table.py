@@ -280,11 +280,20 @@ def run_and_measure(
 def task_config(task: TouchTask) -> RunConfig:
     """The configuration of a session."""
     _, simulation, touch, keyframes, _, new_ground = ROWS[task.row]
-    maze = {"seed": task.maze} | simulation.get("maze", {})
-    simulation = simulation | {"seed": task.seed, "maze": maze}
-    parts = {"simulation": simulation, "touch": touch, "keyframes": keyframes, "backend": task.backend}
-    config = RunConfig.model_validate(parts)
+    parts = {"touch": touch, "keyframes": keyframes, "backend": task.backend}
+    config = touch_config(task.maze, task.seed, simulation, **parts)
     return with_new_ground(config, new_ground) if new_ground else config
+
+
+def touch_config(maze: int, seed: int, simulation: dict[str, Any], **parts: Any) -> RunConfig:
+    """The configuration of a whisker session.
+
+    Args:
+        maze: seed of the maze. seed: of everything else. simulation: further settings of `simulation`; those
+            of `maze` are added to its seed. parts: settings beside `simulation`.
+    """
+    simulation = simulation | {"seed": seed, "maze": {"seed": maze} | simulation.get("maze", {})}
+    return RunConfig.model_validate({"simulation": simulation, **parts})
 
 
 def _share_of_revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:
