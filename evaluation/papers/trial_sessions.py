@@ -25,7 +25,7 @@ from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.trajectory import ate
 from evaluation.studies.metrics import SessionResult
 from evaluation.studies.perturbation import Perturbation
-from ratslam.core.backend import Backend
+from ratslam.core.backend import Backend, Map
 from ratslam.core.compilation import Precision, prepare_precision
 from ratslam.core.session import Session, capacity_at
 from ratslam.grid.config import GridConfig
@@ -64,17 +64,13 @@ def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
     return config, log
 
 
-def run_session(
-    config: RunConfig,
-    log: InMemorySource,
-    start: Callable[[RunConfig, InMemorySource], Session] | None = None,
-) -> SessionResult:
+def run_session(config: RunConfig, log: InMemorySource, session: Session | None = None) -> SessionResult:
     """Runs a session from memory, with a configuration completed by its source.
 
     Args:
-        start: makes the session; None: `start_session`.
+        session: at its start; None: that of `start_session`.
     """
-    session = (start or start_session)(config, log)
+    session = session or start_session(config, log)
     steps = list(session.replay(observation_of(sample) for sample in log))
     place = np.array([int(step.estimate.place) for step in steps])
     nodes = session.map.graph().nodes
@@ -144,27 +140,6 @@ _compiled = lru_cache(maxsize=2)(_build)
 """A session of any state; a recently compiled one is used again."""
 
 
-class RecordingRun(NamedTuple):
-    """A finished session of T steps over a recording.
-
-    Attributes:
-        config: completed for the recording. truth: [T, 3] true poses, rows of NaN where unknown. odometry,
-            online, final: [T, 3] poses by dead reckoning, as estimated at the time, and of the final map.
-    """
-
-    config: RunConfig
-    session: Session
-    truth: np.ndarray
-    odometry: np.ndarray
-    online: np.ndarray
-    final: np.ndarray
-
-    def ate(self, poses: np.ndarray) -> float:
-        """ATE of poses [T, 3] at the steps with truth, m."""
-        known = np.isfinite(self.truth).all(axis=1)
-        return ate(poses[known], self.truth[known])
-
-
 class ClosureClaims(NamedTuple):
     """What n candidates of closure sequences claim, beside the truth; n is 0 for maps without candidates.
 
@@ -185,8 +160,20 @@ class ClosureClaims(NamedTuple):
     log_odds: np.ndarray
 
 
-def run_recording(config: RunConfig, perturbation: Perturbation | None = None, seed: int = 0) -> RecordingRun:
+def known_ate(poses: np.ndarray, truth: np.ndarray) -> float:
+    """ATE of poses [T, 3] at the steps whose true pose [T, 3] is known, m."""
+    known = np.isfinite(truth).all(axis=1)
+    return ate(poses[known], truth[known])
+
+
+def run_recording(
+    config: RunConfig, perturbation: Perturbation | None = None, seed: int = 0
+) -> tuple[RunConfig, Session, SessionResult]:
     """Maps a recording, or the perturbed copy of a seed.
+
+    Returns:
+        the configuration completed for the recording, the finished session, and its outcome, with rows of NaN
+        where the truth is unknown.
 
     Raises:
         InputError: the recording cannot be used, or has no truth.
@@ -198,21 +185,14 @@ def run_recording(config: RunConfig, perturbation: Perturbation | None = None, s
     if perturbation is not None:
         log = perturbation(log, seed)
     session = build_session(config, log)
-    steps = list(session.replay(observation_of(sample) for sample in log))
-    return RecordingRun(
-        config=config,
-        session=session,
-        truth=np.asarray(log.truth),
-        odometry=integrate(log.motion[:, :3]),
-        online=np.array([step.pose for step in steps]),
-        final=session.map.trajectory(),
-    )
+    return config, session, run_session(config, log, session)
 
 
-def closure_claims(run: RecordingRun) -> ClosureClaims:
-    """The claims of all candidates in closures.csv that belong to a sequence."""
+def closure_claims(map: Map, truth: np.ndarray) -> ClosureClaims:
+    """The claims of all candidates in closures.csv of a map that belong to a sequence, beside true poses
+    [T, 3]."""
     rows = list[dict[str, str]]()
-    if (write := run.session.map.files().get("closures.csv")) is not None:
+    if (write := map.files().get("closures.csv")) is not None:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "closures.csv"
             write(path)
@@ -222,8 +202,8 @@ def closure_claims(run: RecordingRun) -> ClosureClaims:
         np.array([int(row[name]) for row in rows], int)
         for name in ("step", "match_step", "shift", "sequence")
     )
-    later, earlier = run.truth[step], run.truth[match]
-    angle = run.session.map.feedback().angle if rows else 0.0
+    later, earlier = truth[step], truth[match]
+    angle = map.feedback().angle if rows else 0.0
     return ClosureClaims(
         sequence=sequence,
         accepted=np.array([row["verdict"] == "accepted" for row in rows], bool),

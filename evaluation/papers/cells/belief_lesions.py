@@ -205,7 +205,8 @@ def _run_lesion(task: tuple[str, str, int]) -> tuple[SessionFigures | None, set[
         functions = LESIONS[lesion](maze)
     with replaced(functions):
         if not row:
-            claims = closure_claims(run_recording(INTEL.configuration()))
+            _, session, run = run_recording(INTEL.configuration())
+            claims = closure_claims(session.map, run.truth)
             true = int((claims.accepted & (claims.distance <= FALSE_DISTANCE)).sum())
             return None, {(step,) for step in np.flatnonzero(claims.accepted).tolist()}, true
         result, figures = run_and_measure(TouchTask(row, maze), new_session)

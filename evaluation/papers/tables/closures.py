@@ -83,7 +83,7 @@ def _judge_session(task: TouchTask) -> JudgedSession:
     with open_observations(task_config(task)) as (config, source):
         log = load_into_memory(source)
     session = start_session(config, log)
-    truth, map = run_session(config, log, lambda *_: session).truth, session.map
+    truth, map = run_session(config, log, session).truth, session.map
     assert isinstance(map, KeyframeMap)
     final, graph, steps = map.solution(), map.keyframes(), map.keyframe_steps()
     scores = final.log.scores()

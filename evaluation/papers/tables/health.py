@@ -19,13 +19,12 @@ from scipy.special import expit
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.statistics import auc
-from evaluation.metrics.trajectory import ate
 from evaluation.papers.tables.buildings import HARM_FACTOR, HARM_MARGIN
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import Recording, real_recordings
 from evaluation.papers.tables.spoilt_maps import spoilt_maps
 from evaluation.papers.tables.touch_table import MAIN, NOISE, ROWS, touch_config
-from evaluation.papers.trial_sessions import run_recording
+from evaluation.papers.trial_sessions import known_ate, run_recording
 from evaluation.studies.executor import run_tasks
 from evaluation.studies.perturbation import miscalibrate
 from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT
@@ -93,16 +92,14 @@ def _judge_session(task: tuple[str, int]) -> np.ndarray:
     number = task[1]
     config, touch = task_config(*task)
     copied = number > 0 and not touch
-    run = run_recording(config, miscalibrate if copied else None, number)
-    map = run.session.map
+    _, session, run = run_recording(config, miscalibrate if copied else None, number)
+    map = session.map
     assert isinstance(map, KeyframeMap)
     truth, graph = run.truth[map.keyframe_steps()], map.keyframes()
     known = np.isfinite(truth).all(axis=1)
 
     def error(poses: np.ndarray) -> float:
-        if touch:
-            return energy_all_pairs(poses[known], truth[known]).total
-        return ate(poses[known], truth[known])
+        return energy_all_pairs(poses[known], truth[known]).total if touch else known_ate(poses, truth)
 
     before = error(graph.dead_reckoned())
     limit = HARM_FACTOR * before + (0.0 if touch else HARM_MARGIN)

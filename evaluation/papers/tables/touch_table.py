@@ -20,7 +20,7 @@ from evaluation.metrics.run_metrics import energy_within_pieces, unjoined_share
 from evaluation.metrics.statistics import wilson_interval
 from evaluation.papers.tables.comparison import Compared, Files, SessionLog, compare_runs
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.trial_sessions import run_session
+from evaluation.papers.trial_sessions import run_session, start_session
 from evaluation.studies.executor import run_tasks
 from evaluation.studies.growth import with_new_ground
 from evaluation.studies.metrics import (
@@ -237,12 +237,12 @@ def _measure_session(task: TouchTask) -> SessionFigures:
 
 
 def run_and_measure(
-    task: TouchTask, start: Callable[[RunConfig, InMemorySource], Session] | None = None
+    task: TouchTask, start: Callable[[RunConfig, InMemorySource], Session] = start_session
 ) -> tuple[SessionResult, SessionFigures]:
     """Runs one session, and measures it.
 
     Args:
-        start: makes the session, see `run_session`.
+        start: makes the session from the completed configuration and its source.
     """
     with open_observations(task_config(task)) as (config, source):
         kidnaps = np.flatnonzero(source.source.kidnapped).tolist()  # type: ignore[attr-defined]
@@ -252,7 +252,7 @@ def run_and_measure(
         log = replace(log, views=log.views[order].copy())
     if task.row == "control: no image":
         log = replace(log, views=np.zeros_like(log.views))
-    result = run_session(config, log, start)
+    result = run_session(config, log, start(config, log))
     truth = result.truth
     true_closures = result.closures[closure_errors(result.truth, result.closures) <= FALSE_CLOSURE_DISTANCE]
     returned = experience_metric_if_defined(result) is not None  # else a quarter is the base set

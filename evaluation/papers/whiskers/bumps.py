@@ -12,10 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.trajectory import align, ate
+from evaluation.metrics.trajectory import align
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import require_recordings
+from evaluation.papers.trial_sessions import known_ate
 from evaluation.plots import style
 from ratslam.core.estimates import GridDrawing
 from ratslam.core.session import Session
@@ -193,7 +194,7 @@ def _run(
     online = np.array([step.pose for step in session.replay(observations)])
     path, grid = session.map.trajectory(), session.map.grid()
     assert grid is not None
-    return _ate(path, truth), _ate(online, truth), path, grid
+    return known_ate(path, truth), known_ate(online, truth), path, grid
 
 
 def _odometry_errors(observations: list[Observation], truth: np.ndarray) -> dict[str, float]:
@@ -204,7 +205,7 @@ def _odometry_errors(observations: list[Observation], truth: np.ndarray) -> dict
     def error(turn: float = 1.0, drift: float = 0.0, slip: float = 0.0) -> float:
         motion = moves[:, :3] * [1, 1, turn] + drift * moves[:, 3:] * [0, 0, 1]
         motion[pressed] *= [1 - slip, 1 - slip, 1 - slip / 2]
-        return _ate(integrate(motion), truth)
+        return known_ate(integrate(motion), truth)
 
     corrected, drifts = correct_observations(OTHER_CREATES, observations), np.arange(-0.5, 0.5, 0.02)
     return {
@@ -212,7 +213,7 @@ def _odometry_errors(observations: list[Observation], truth: np.ndarray) -> dict
         "odometry, turn scale fitted to the truth": min(error(turn=s) for s in np.arange(0.8, 1.3, 0.01)),
         "odometry, heading drift fitted to the truth": min(error(drift=d / 60) for d in drifts),
         "odometry without forward motion and half of the turn in pressed steps": error(slip=1.0),
-        f"odometry, {OTHERS}": _ate(_dead_reckoning(corrected), truth),
+        f"odometry, {OTHERS}": known_ate(_dead_reckoning(corrected), truth),
     }
 
 
@@ -228,10 +229,6 @@ def _dead_reckoning(observations: list[Observation]) -> np.ndarray:
 
 def _known(truth: np.ndarray) -> np.ndarray:
     return np.isfinite(truth).all(axis=1)
-
-
-def _ate(path: np.ndarray, truth: np.ndarray) -> float:
-    return ate(path[_known(truth)], truth[_known(truth)])
 
 
 def _aligned(path: np.ndarray, truth: np.ndarray) -> np.ndarray:
