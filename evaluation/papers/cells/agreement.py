@@ -36,9 +36,9 @@ from evaluation.cells.rate_map import (
     tuning_curves,
 )
 from evaluation.cells.recording import BinnedSums
-from evaluation.papers.cells.panels import table_lines
 from evaluation.papers.cells.rat_sessions import SECONDS, record_rat
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from tactile.base.errors import InputError
 
 CELLS, GOAL = 100, 1e-6

@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evaluation.papers.cells.panels import name_panel, panel_grid, table_lines, time_call
+from evaluation.papers.cells.panels import name_panel, panel_grid, time_call
 from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.buildings import FALSE_DISTANCE
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import Recording
 from evaluation.papers.tables.touch_table import SessionFigures, TouchTask, run_and_measure, task_config
 from evaluation.papers.trial_sessions import closure_claims, collect_session, new_session, run_recording

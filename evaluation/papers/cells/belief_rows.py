@@ -18,8 +18,9 @@ import numpy as np
 
 from evaluation.papers.cells import belief_world as worlds
 from evaluation.papers.cells.belief_world import AROUND, CELLS, LOOKS, PARTICLES, World, exact, network, pace
-from evaluation.papers.cells.panels import name_panel, panel_grid, table_lines
+from evaluation.papers.cells.panels import name_panel, panel_grid
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.plots import style
 from evaluation.studies.executor import run_tasks
 from ratslam.mapping.config import KeyframeMapConfig

@@ -17,9 +17,10 @@ from scipy import fft
 
 from evaluation.cells.rate_map import bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.panels import name_panel, panel_row, table_lines
+from evaluation.papers.cells.panels import name_panel, panel_row
 from evaluation.papers.cells.rat_sessions import RatSessions, column_activity
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
 from tactile.base.se2 import wrap

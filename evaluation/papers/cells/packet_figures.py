@@ -24,11 +24,11 @@ from evaluation.papers.cells.panels import (
     panel_grid,
     shortest,
     spread_dots,
-    table_lines,
     torus_error,
 )
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.plots import style
 from evaluation.studies.network_batch import CellSets, walk
 from evaluation.studies.study_course import StudyCourse, expected_poses, read_course

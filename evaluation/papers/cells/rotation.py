@@ -18,16 +18,10 @@ from evaluation.cells.decoding import truth_in_sheet
 from evaluation.cells.head_direction import preferred_direction
 from evaluation.cells.rate_map import bin_activity, tuning_curves
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.panels import (
-    name_panel,
-    panel_grid,
-    shortest,
-    spread_dots,
-    table_lines,
-    torus_error,
-)
+from evaluation.papers.cells.panels import name_panel, panel_grid, shortest, spread_dots, torus_error
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.plots import style
 from tactile.base.se2 import wrap
 

@@ -28,9 +28,9 @@ from evaluation.cells.rate_map import (
 )
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import Calibration, PathBins, Score, calibrate, shuffled_scores
-from evaluation.papers.cells.panels import table_lines
 from evaluation.papers.cells.rat_sessions import SECONDS, Way, record_rat
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.studies.executor import run_tasks
 
 CELLS, TRUE_CELLS, SHUFFLES = 500, 100, 100

@@ -26,9 +26,10 @@ from evaluation.cells.grid_score import (
 from evaluation.cells.rate_map import place_index, sample_seconds, smooth_rates
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import PathBins, ShuffledScores, shuffled_scores
-from evaluation.papers.cells.panels import panel_row, table_lines
+from evaluation.papers.cells.panels import panel_row
 from evaluation.papers.cells.rat_sessions import RatSessions, column_activity
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
 

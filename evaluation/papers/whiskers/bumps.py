@@ -14,7 +14,7 @@ import numpy as np
 
 from evaluation.metrics.trajectory import align
 from evaluation.papers.figure import Figure
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import require_recordings
 from evaluation.papers.trial_sessions import known_ate
 from evaluation.plots import style
@@ -125,26 +125,24 @@ def _measure(folder: Path) -> BumpsResult:
 
 def _table(result: BumpsResult) -> list[str]:
     """The lines of the table: odometry, then the variants of the filter."""
-    lines = markdown_header(("real Create, bumpers", "ATE, median (worst) m", "live", "worse than odometry"))
-    rows = lines.split("\n")
-    rows += [markdown_row([name, f"{value:.2f}", "", ""]) for name, value in result.odometry.items()]
+    rows = [[name, f"{value:.2f}", "", ""] for name, value in result.odometry.items()]
     for name, final in result.final.items():
         online = result.online[name]
         control = result.odometry[f"odometry, {OTHERS}" if name == OTHERS else "odometry"]
         cells = (f"{np.median(each):.2f} ({each.max():.2f})" for each in (final, online))
-        rows.append(markdown_row([name, *cells, f"{(final > control).sum()} of {len(final)}"]))
+        rows.append([name, *cells, f"{(final > control).sum()} of {len(final)}"])
     low, middle, high = np.percentile(result.distance, (10, 50, 90))
-    return [
-        *rows,
-        "",
+    below = (
         f"{len(result.distance)} contacts; the true distance to the nearest wall is {middle:.3f} m "
         f"({low:.3f} to {high:.3f}, 10-90 %); assumed are 0.17 m. Fits use the truth: bounds, not results. "
         f"In steps that begin in contact the robot advances by {result.advance[0]:.2f} of its odometry, "
         f"in others by {result.advance[1]:.2f}. `slip, no map` leaves out what the map says. The slip was "
         "found, and the correction by other Creates chosen, on this drive: neither is held out. "
         "Where bumps at random times reach the same median, the ATE of one drive does not "
-        "show that bumps help.",
-    ]
+        "show that bumps help."
+    )
+    columns = "real Create, bumpers", "ATE, median (worst) m", "live", "worse than odometry"
+    return table_lines([], columns, rows, [below])
 
 
 def _draw(result: BumpsResult, file: Path) -> None:

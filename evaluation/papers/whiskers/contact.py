@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from scipy.ndimage import uniform_filter1d
 
 from evaluation.papers.figure import Figure
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import REACH, require_recordings
 from evaluation.papers.whiskers.drift import Decide, Snippet, fit_free_model, score_stream, simulate_stream
 from evaluation.plots import style
@@ -127,13 +127,13 @@ class _ContactResult(NamedTuple):
 
 def _list_contacts(result: _ContactResult) -> list[str]:
     """The tables of the page."""
-    hours = [markdown_header(
-        ("stream", "rule", "contacts longer than 0.1 s", "missed", "false contacts", "share of free rows")
-    )]  # fmt: skip
-    for stream, scores in result.streams.items():
-        for rule, (contacts, missed, false, wrong, free) in scores.items():
-            hours.append(markdown_row([stream, rule, contacts, missed, false, f"{wrong / free:.2g}"]))
-    parts = (_whisker_table(result), hours, result.marks, _sentences(result))
+    columns = "stream", "rule", "contacts longer than 0.1 s", "missed", "false contacts", "share of free rows"
+    hours = [
+        [stream, rule, *counts, f"{wrong / free:.2g}"]
+        for stream, scores in result.streams.items()
+        for rule, (*counts, wrong, free) in scores.items()
+    ]
+    parts = (_whisker_table(result), table_lines([], columns, hours), result.marks, _sentences(result))
     return [line for part in parts for line in ("", *part)][1:]
 
 
@@ -141,13 +141,13 @@ def _whisker_table(result: _ContactResult) -> list[str]:
     half = len(result.contact) // 2
     halves = [part.mean(axis=0) for part in (result.contact[:half], result.contact[half:])]
     columns = "in contact, first half", "second half", "contacts", "20-sd rule", "contacts", "remark"
-    lines = [markdown_header(("whisker", *columns))]
+    rows = []
     for w, name in enumerate(WHISKERS):
         tracked, fixed = (len(true_runs(found[:, w])) for found in (result.contact, result.fixed))
         early, late = (f"{part[w]:.1%}" for part in halves)
         share = f"{result.fixed[:, w].mean():.1%}"
-        lines.append(markdown_row([name, early, late, tracked, share, fixed, _remark(result, w)]))
-    return lines
+        rows.append([name, early, late, tracked, share, fixed, _remark(result, w)])
+    return table_lines([], ("whisker", *columns), rows)
 
 
 def _remark(result: _ContactResult, whisker: int) -> str:
@@ -369,20 +369,19 @@ def _mark_lines(contacts: dict[str, np.ndarray], touching: np.ndarray) -> list[s
         return ["Precision and recall: not annotated."]
     one, other = marks.values()
     agreed = np.where(one == other, one, UNCLEAR)
-    lines = [
+    above = (
         f"Annotators {' and '.join(marks)}: agreement {(one == other).mean():.1%} of rows, unclear "
-        f"{(agreed == UNCLEAR).mean():.1%} (goal: at most 15 %).",
-        "",
-        "| whisker | rule | unclear | precision | recall | unclear counted as wrong: precision | recall |",
-        "|---|---|---|---|---|---|---|",
-    ]
+        f"{(agreed == UNCLEAR).mean():.1%} (goal: at most 15 %)."
+    )
+    columns = "precision", "recall", "unclear counted as wrong: precision", "recall"
+    lines = []
     rows: list[tuple[str, str, Any]] = [("**those that touch**", rule, touching) for rule in contacts]
     rows += [(name, rule, w) for rule in contacts for w, name in enumerate(WHISKERS)]
     for name, rule, which in rows:
         *figures, unclear = score_contacts(contacts[rule][:, which], agreed[:, which])
         shown = ("-" if np.isnan(figure) else f"{figure:.3f}" for figure in figures)
-        lines.append(markdown_row([name, rule, f"{unclear:.1%}", *shown]))
-    return lines
+        lines.append([name, rule, f"{unclear:.1%}", *shown])
+    return table_lines([above], ("whisker", "rule", "unclear", *columns), lines)
 
 
 FIGURE = Figure(

@@ -16,7 +16,7 @@ import numpy as np
 from evaluation.metrics.trajectory import align, ate
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.buildings import buildings_rows
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import metres, require_recordings
 from evaluation.papers.trial_sessions import closure_claims, known_ate, run_recording
 from evaluation.papers.whiskers.bumps import wall_distances
@@ -176,7 +176,7 @@ def _measure_create(folder: Path) -> CreateResult:
 def _table_create(result: CreateResult) -> list[str]:
     """The lines of the tables."""
     odometry = metres(next(iter(result.variants.values())).odometry)
-    lines = [markdown_header(COLUMNS), markdown_row(["odometry (control)", odometry, odometry, *["-"] * 6])]
+    rows = [["odometry (control)", odometry, odometry, *["-"] * 6]]
     for name, variant in result.variants.items():
         label = f"{name} (control)"
         if name.startswith("create "):
@@ -189,15 +189,16 @@ def _table_create(result: CreateResult) -> list[str]:
             share = f"{variant.candidates}, {variant.right / max(variant.candidates, 1):.0%}"
             cells += [f"{variant.doubt:.2f}", f"{variant.accepted}", f"{variant.false}", share]
             cells.append(metres(variant.revisits))
-        lines.append(markdown_row([label, *cells]))
-    lines.append(markdown_row(["odometry, true turns (bound)", metres(result.true_turns), *["-"] * 7]))
-    walls = [markdown_header(("robot to the nearest wall, m", "number", *(f"{p} %" for p in PERCENTILES)))]
+        rows.append([label, *cells])
+    rows.append(["odometry, true turns (bound)", metres(result.true_turns), *["-"] * 7])
+    walls = []
     names = "at the first reading of a contact", "at all readings (control)"
     for name, values in zip(names, result.distances, strict=True):
         spread = np.percentile(values, PERCENTILES)
-        walls.append(markdown_row([name, len(values), *(f"{value:.3f}" for value in spread)]))
+        walls.append([name, len(values), *(f"{value:.3f}" for value in spread)])
+    columns = "robot to the nearest wall, m", "number", *(f"{p} %" for p in PERCENTILES)
     caveats = CAVEATS.format(drift=result.drift, latency=result.latency)
-    return [*lines, "", _summary(result), "", *walls, "", caveats]
+    return table_lines([], COLUMNS, rows, table_lines([_summary(result)], columns, walls, [caveats]))
 
 
 CAVEATS = (

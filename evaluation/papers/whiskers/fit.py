@@ -8,7 +8,7 @@ import numpy as np
 
 from evaluation.metrics.trajectory import ate
 from evaluation.papers.figure import Figure
-from evaluation.papers.tables.markdown import markdown_row
+from evaluation.papers.tables.markdown import markdown_row, table_lines
 from evaluation.papers.tables.recordings import REACH, require_recordings
 from evaluation.plots import style
 from ratslam.runs.build_session import open_source
@@ -98,29 +98,27 @@ def _errors(records: dict[str, _Record]) -> np.ndarray:
 def _table(result: _Rigs) -> list[str]:
     """The wheels by record and half, dead reckoning before and after, and the whiskers of the arm."""
     records, signals, whiskers = result
-    lines = [
-        "Wheels: each quantity of the whole record, and of its first and second half.",
-        "",
-        "| record | true over measured distance | true over measured turn | heading bias, rad/m |",
-        "|---|---|---|---|",
-    ]
+    wheels = []
     for name, (fits, _, revisits) in records.items():
         cells = ["; ".join(_pair(getattr(fit, key)) for fit in fits) for key in VALUES]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
+        wheels.append([name, *cells])
         if revisits is not None:
             known = {one.name: (one.value, one.sd or 0.0) for one in revisits.quantities}
             turn, bias = _pair(known.get("turn scale")), _pair(known["heading bias"])
-            lines.append(f"| {name}, from revisits alone | not told by revisits | {turn} | {bias} |")
-    lines += [
-        "",
-        "Dead reckoning (ATE, m) of each half: as recorded, and with what the other half tells.",
-        "",
-        "| record | first half | corrected by the second | second half | corrected by the first |",
-        "|---|---|---|---|---|",
-    ]
-    for name, errors in zip(records, _errors(records), strict=True):
-        lines.append(markdown_row([name, *(f"{error:.2f}" for error in errors.flat)]))
-    return [*lines, "", *_whisker_lines(signals, whiskers)]
+            wheels.append([f"{name}, from revisits alone", "not told by revisits", turn, bias])
+    reckoned = (
+        [name, *(f"{error:.2f}" for error in errors.flat)]
+        for name, errors in zip(records, _errors(records), strict=True)
+    )
+    halves = table_lines(
+        ["Dead reckoning (ATE, m) of each half: as recorded, and with what the other half tells."],
+        ("record", "first half", "corrected by the second", "second half", "corrected by the first"),
+        reckoned,
+        _whisker_lines(signals, whiskers),
+    )
+    above = "Wheels: each quantity of the whole record, and of its first and second half."
+    columns = "record", "true over measured distance", "true over measured turn", "heading bias, rad/m"
+    return table_lines([above], columns, wheels, halves)
 
 
 def _whisker_lines(signals: SignalRecord, fit: SignalFit) -> list[str]:
