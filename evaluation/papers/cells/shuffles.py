@@ -8,6 +8,7 @@ from typing import get_args
 
 import numpy as np
 
+from evaluation.cells import rate_map
 from evaluation.cells.fields import border_score, largest_field
 from evaluation.cells.grid_score import HEXAGONAL, SQUARE, autocorrelogram, lattice_scores
 from evaluation.cells.head_direction import mean_vector_length, rayleigh_z
@@ -17,14 +18,6 @@ from evaluation.cells.information import (
     information_rate,
     selectivity,
     sparsity,
-)
-from evaluation.cells.rate_map import (
-    arena_edges,
-    coherence,
-    heading_index,
-    place_index,
-    sample_seconds,
-    smooth_rates,
 )
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import Calibration, PathBins, Score, calibrate, shuffled_scores
@@ -108,7 +101,7 @@ SMOOTHING = 1.5
 
 def _smoothed(score: Score) -> Score:
     """The score of the smoothed map."""
-    return lambda rates, seconds: score(smooth_rates(rates, seconds, SMOOTHING), seconds)
+    return lambda rates, seconds: score(rate_map.smooth_rates(rates, seconds, SMOOTHING), seconds)
 
 
 PLACE_SCORES: Mapping[str, Score] = {
@@ -116,7 +109,7 @@ PLACE_SCORES: Mapping[str, Score] = {
     "information rate": _smoothed(information_rate),
     "1 - sparsity": _smoothed(lambda rates, seconds: 1 - sparsity(rates, seconds)),
     "selectivity": _smoothed(selectivity),
-    "coherence": coherence,
+    "coherence": rate_map.coherence,
     "largest field": _smoothed(largest_field),
     "border score": _smoothed(border_score),
     "grid score": _smoothed(lambda rates, seconds: lattice_scores(autocorrelogram(rates), HEXAGONAL)),
@@ -140,9 +133,9 @@ def path_bins(recording: CellRecording, kind: str) -> PathBins:
     """The bin of each step by a kind of `SCORES`: of place, 20 x 20 over the box that the path fills; of
     heading, 36; or of both, 8 x 10 x 10."""
     turns, across = (8, 10) if kind == "joint" else (36, 20)
-    seconds = sample_seconds(recording.time)
-    place = place_index(recording.truth, *arena_edges(recording.truth, across))
-    heading = heading_index(recording.truth, turns)
+    seconds = rate_map.sample_seconds(recording.time)
+    place = rate_map.place_index(recording.truth, *rate_map.arena_edges(recording.truth, across))
+    heading = rate_map.heading_index(recording.truth, turns)
     if kind == "place":
         return PathBins(place, (across, across), seconds)
     if kind == "heading":

@@ -14,16 +14,8 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from evaluation.papers.figure import Figure
+from evaluation.papers.maps import localisation_metrics as metrics
 from evaluation.papers.maps import scenarios
-from evaluation.papers.maps.localisation_metrics import (
-    BUILDING,
-    RIGHT,
-    SAME_HEADING,
-    WRONG,
-    MapSteps,
-    Tolerance,
-    pose_errors,
-)
 from evaluation.papers.maps.operations import MapTask, Measured, column
 from evaluation.papers.maps.pictures import PathPanel, at_least, count, draw_panels, spread, table
 from evaluation.papers.maps.scenarios import Recipe, record
@@ -34,7 +26,7 @@ from ratslam.runs.settings.run_config import load_config
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, integrate, inverse
 
-REVISIT = Tolerance(RIGHT.distance, float(SAME_HEADING))
+REVISIT = metrics.Tolerance(metrics.RIGHT.distance, float(metrics.SAME_HEADING))
 """A later step is a revisit of an earlier one that is as near as this."""
 
 
@@ -62,12 +54,12 @@ class Join(NamedTuple):
         first, last = slice(earlier), slice(earlier + entry, None)
         piece = _most_common(arrays.piece[first])
         inside = arrays.piece[first] == piece
-        steps = MapSteps.known(arrays.trajectory[first][inside], arrays.truth[first][inside])
+        steps = metrics.MapSteps.known(arrays.trajectory[first][inside], arrays.truth[first][inside])
         pose, truth = arrays.trajectory[last], arrays.truth[last]
         if revisits:
             again = steps.revisited(truth, REVISIT)
             pose, truth = pose[again], truth[again]
-        error = steps.errors(pose, truth, RIGHT.distance)
+        error = steps.errors(pose, truth, metrics.RIGHT.distance)
         known = np.isfinite(error).all(axis=1)
         middle = np.median(error[known], axis=0) if known.any() else np.full(2, np.nan)
         path = steps.align(arrays.trajectory[earlier:])[:, :2]
@@ -81,7 +73,7 @@ class Join(NamedTuple):
     @property
     def wrong(self) -> bool:
         """Joined, and off by more than `WRONG`."""
-        return self.joined and bool(WRONG.exceeded(self.error[None])[0])
+        return self.joined and bool(metrics.WRONG.exceeded(self.error[None])[0])
 
     @property
     def off(self) -> float:
@@ -279,17 +271,17 @@ def _measure_halves(task: MapTask) -> Measured:
     label[given] = label[random.permutation(given)]
     log = replace(log, digest=f"{log.digest}+shuffled", views=views, label=label)
     mixed = task.methods.localise(first, scenarios.Recorded(recorded.config, log))
-    again, at = steps.revisited(truth, BUILDING), localised.found
+    again, at = steps.revisited(truth, metrics.BUILDING), localised.found
 
     def shares(found: np.ndarray, pose: np.ndarray) -> tuple[float, float]:
-        off = BUILDING.exceeded(pose_errors(steps.align(pose), truth))
+        off = metrics.BUILDING.exceeded(metrics.pose_errors(steps.align(pose), truth))
         return float(found[again].mean()), float(off[found].mean()) if found.any() else 0.0
 
     said = steps.align(localised.pose)
     found, off = shares(at, localised.pose)
     shuffled_found, shuffled_off = shares(mixed.found, mixed.pose)
-    nearby = steps.errors(localised.pose, truth, BUILDING.distance)
-    nearest = steps.nearest(truth, BUILDING.distance)
+    nearby = steps.errors(localised.pose, truth, metrics.BUILDING.distance)
+    nearest = steps.nearest(truth, metrics.BUILDING.distance)
     perfect = compose(steps.pose[nearest], between(steps.truth[nearest], truth))
     # Odometry from the first step with a true pose on.
     known = np.isfinite(truth).all(axis=1)
@@ -302,8 +294,8 @@ def _measure_halves(task: MapTask) -> Measured:
         "found": found,
         "off": off,
         "off_by_map": shares(at, perfect)[1],
-        "off_nearby": float(BUILDING.exceeded(nearby)[at].mean()) if at.any() else 0.0,
-        "off_by_odometry": float(BUILDING.exceeded(pose_errors(path, true)).mean()),
+        "off_nearby": float(metrics.BUILDING.exceeded(nearby)[at].mean()) if at.any() else 0.0,
+        "off_by_odometry": float(metrics.BUILDING.exceeded(metrics.pose_errors(path, true)).mean()),
         "shuffled_found": shuffled_found,
         "shuffled_off": shuffled_off,
     }
@@ -312,7 +304,7 @@ def _measure_halves(task: MapTask) -> Measured:
         "second, true": truth[:, :2],
         "second, found": np.where(at[:, None], said[:, :2], np.nan),
     }
-    error = np.where(at, pose_errors(said, truth)[:, 0], np.nan)
+    error = np.where(at, metrics.pose_errors(said, truth)[:, 0], np.nan)
     return Measured(figures, {"name": name, "revisited": int(again.sum()), "paths": paths, "error": error})
 
 
@@ -347,7 +339,7 @@ def _draw_halves(found: Sequence[Measured], png: Path) -> None:
         curves={
             name: [error[np.linspace(0, len(error) - 1, 100).astype(int)]] for name, error in errors.items()
         },
-        limits={"wrong": BUILDING.distance},
+        limits={"wrong": metrics.BUILDING.distance},
         paths=PathPanel(f"{most['name']}: the second half in the map of the first", None, most["paths"]),
     )
 

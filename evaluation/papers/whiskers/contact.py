@@ -21,17 +21,10 @@ from evaluation.papers.tables.recordings import REACH, require_recordings
 from evaluation.papers.whiskers.drift import Decide, Snippet, fit_free_model, score_stream, simulate_stream
 from evaluation.plots import style
 from robot.recordings.real_whiskers import WHISKERS, ReachConfig, ReachRecord, read_reach
+from tactile import contact_stream
 from tactile.base.errors import InputError
 from tactile.base.samples import true_runs
 from tactile.calibration import FreeBaseline, calibrate_free
-from tactile.contact_stream import (
-    StreamState,
-    Touch,
-    date_back,
-    find_contacts,
-    find_fixed_contacts,
-    start_stream,
-)
 
 CONTACT_SDS = 20.0
 """Departure that makes a contact of the record one to find in the spliced hours: the paper's."""
@@ -247,11 +240,11 @@ def _measure_contacts(data: Path) -> _ContactResult:
     signal, first = record.signal, record.signal[: config.free_rows]
     free = calibrate_free(config.free, first)
     touch, baseline = _follow(config, free, signal)
-    fixed = find_fixed_contacts(first, signal)
+    fixed = contact_stream.find_fixed_contacts(first, signal)
     dirty = np.array([whisker in free.dirty for whisker in range(len(WHISKERS))])
     away = np.abs(signal - free.mean).max(axis=0) / free.noise
     never = (away < CONTACT_SDS).all(axis=1)
-    contact = touch == Touch.CONTACT
+    contact = touch == contact_stream.Touch.CONTACT
     tripled = {name: _score_tripled(config, free, signal, contact, name) for name in RULES}
     return _ContactResult(
         config=config,
@@ -259,7 +252,7 @@ def _measure_contacts(data: Path) -> _ContactResult:
         free=free,
         away=away.max(axis=1),
         contact=contact,
-        bent=(touch == Touch.BENT).any(axis=0),
+        bent=(touch == contact_stream.Touch.BENT).any(axis=0),
         fixed=fixed,
         baseline=baseline,
         never=never,
@@ -273,25 +266,25 @@ def _measure_contacts(data: Path) -> _ContactResult:
 
 def _follow(config: ReachConfig, free: FreeBaseline, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[T, W] states, each contact from its first row on, and the baselines [T, W, K]."""
-    plan, state = start_stream(config.contact, free, config.rate)
+    plan, state = contact_stream.start_stream(config.contact, free, config.rate)
     parts, baselines = [], []
     for first in range(0, len(signal), plan.block):
         baselines.append(np.repeat(state.baseline[None], len(signal[first : first + plan.block]), axis=0))
-        state, touch = find_contacts(plan, state, signal[first : first + plan.block])
+        state, touch = contact_stream.find_contacts(plan, state, signal[first : first + plan.block])
         parts.append(touch)
-    return date_back(plan, np.concatenate(parts)), np.concatenate(baselines)
+    return contact_stream.date_back(plan, np.concatenate(parts)), np.concatenate(baselines)
 
 
 def _decide(config: ReachConfig, free: FreeBaseline, name: str) -> Decide:
     """A rule by name, for a stream whose baseline and noise are known at its start."""
     if name == "20 sd":
         return lambda samples: (np.abs(samples - free.mean) > CONTACT_SDS * free.noise).any(axis=-1)
-    plan, start = start_stream(config.contact, free, config.rate)
-    states: list[StreamState] = [start]
+    plan, start = contact_stream.start_stream(config.contact, free, config.rate)
+    states: list[contact_stream.StreamState] = [start]
 
     def decide(samples: np.ndarray) -> np.ndarray:
-        states[0], touch = find_contacts(plan, states[0], samples)
-        return touch == Touch.CONTACT
+        states[0], touch = contact_stream.find_contacts(plan, states[0], samples)
+        return touch == contact_stream.Touch.CONTACT
 
     return decide
 
