@@ -64,6 +64,19 @@ def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
     return config, log
 
 
+def collect_recording(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
+    """The same of a recording, of which some steps may lack the true pose.
+
+    Raises:
+        InputError: the recording cannot be used, or has no truth.
+    """
+    with open_observations(config) as (config, source):
+        log = load_into_memory(source)
+    if log.truth is None:
+        raise InputError(log.name, "no true poses", "a recording with truth")
+    return config, log
+
+
 def run_session(config: RunConfig, log: InMemorySource, session: Session | None = None) -> SessionResult:
     """Runs a session from memory, with a configuration completed by its source.
 
@@ -178,10 +191,7 @@ def run_recording(
     Raises:
         InputError: the recording cannot be used, or has no truth.
     """
-    with open_observations(config) as (config, source):
-        log = load_into_memory(source)
-    if log.truth is None:
-        raise InputError(log.name, "no true poses", "a recording with truth")
+    config, log = collect_recording(config)
     if perturbation is not None:
         log = perturbation(log, seed)
     session = build_session(config, log)

@@ -35,14 +35,9 @@ class Judged(NamedTuple):
     @classmethod
     def of(cls, steps: MapSteps, localised: Localised, truth: np.ndarray) -> Self:
         """A session beside its true poses [T, 3]."""
-        error = steps.errors(localised.pose, truth, RIGHT.distance)
-        return cls(
-            found=localised.found,
-            foreign=localised.foreign,
-            right=localised.found & RIGHT.holds(error),
-            wrong=localised.found & WRONG.exceeded(error),
-            error=error,
-        )
+        found, error = localised.found, steps.errors(localised.pose, truth, RIGHT.distance)
+        right, wrong = found & RIGHT.holds(error), found & WRONG.exceeded(error)
+        return cls(found, localised.foreign, right, wrong, error)
 
     @property
     def whisks(self) -> float:

@@ -14,10 +14,9 @@ import networkx
 import numpy as np
 
 from evaluation.papers.tables.touch_table import KIDNAPS, MAIN, touch_config
-from evaluation.papers.trial_sessions import collect_session
-from ratslam.runs.build_session import open_observations
+from evaluation.papers.trial_sessions import collect_recording, collect_session
 from ratslam.runs.settings.run_config import RunConfig
-from robot.sources.in_memory import InMemorySource, cut_log, load_into_memory
+from robot.sources.in_memory import InMemorySource, cut_log
 from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre, exploration_route
 from robot.world.scene import PAPER_CIRCUITS, MazeConfig, PathConfig, make_maze
 from tactile.base.errors import InputError
@@ -63,13 +62,8 @@ def record(recipe: Recipe) -> Recorded:
     Raises:
         InputError: the source cannot be read or simulated, or has no true poses.
     """
-    if recipe.config.simulation is not None:
-        config, log = collect_session(recipe.config)
-    else:
-        with open_observations(recipe.config) as (config, source):
-            log = load_into_memory(source)
-        if log.truth is None:
-            raise InputError(log.name, "no true poses", "a recording with truth")
+    collect = collect_recording if recipe.config.simulation is None else collect_session
+    config, log = collect(recipe.config)
     return Recorded(config, cut_log(log, recipe.first, recipe.last))
 
 

@@ -22,14 +22,12 @@ from scipy.special import expit
 from evaluation.metrics.statistics import auc
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.touch_table import CHANGE, TouchTask, task_config
-from evaluation.papers.trial_sessions import run_session, start_session
+from evaluation.papers.trial_sessions import collect_session, run_session, start_session
 from evaluation.studies.executor import run_tasks
 from ratslam.mapping.closure_judge import BEYOND, KINDS, WEIGHTS, SequenceEvidence, sequence_evidence
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap
-from ratslam.runs.build_session import open_observations
-from robot.sources.in_memory import load_into_memory
 from tactile.base.se2 import between, wrap
 
 ROWS = (
@@ -80,8 +78,7 @@ def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = No
 
 def _judge_session(task: TouchTask) -> JudgedSession:
     """Runs a session and judges the sequences of its final map."""
-    with open_observations(task_config(task)) as (config, source):
-        log = load_into_memory(source)
+    config, log = collect_session(task_config(task))
     session = start_session(config, log)
     truth, map = run_session(config, log, session).truth, session.map
     assert isinstance(map, KeyframeMap)
@@ -104,12 +101,12 @@ def fit_weights(sessions: Sequence[JudgedSession]) -> np.ndarray:
     features = np.concatenate([evidence.features() for evidence, _ in versions])
     true = np.concatenate([true for _, true in versions]).astype(float)
     known = np.isfinite(features).all(axis=(1, 2))
-    once = 1 / 3  # a sequence counts once, however often it is judged
-    return np.stack([_regress(features[known, way], true[known], once) for way in (0, 1)])
+    return np.stack([_regress(features[known, way], true[known]) for way in (0, 1)])
 
 
-def _regress(features: np.ndarray, true: np.ndarray, worth: float) -> np.ndarray:
+def _regress(features: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Weights of features [n, F], the first of which is 1, by which they tell what is true [n]."""
+    worth = 1 / 3  # a sequence counts once, however often it is judged
     ridge = RIDGE * (np.arange(features.shape[1]) > 0)
 
     def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:

@@ -54,24 +54,9 @@ def _measure(folder: Path) -> _Rigs:
     return records, signals, fit_signals(signals)
 
 
-def _assignments(name: str, folder: Path) -> list[str]:
-    """Settings that make the packaged configuration read this record of this folder."""
-    config, file = RECORDS[name]
-    parts = {
-        "create_lab": {"views.file": "data/create_lab_depth.csv", "truth.file": "data/create_lab_truth.csv"},
-        "intel_laser": {"views.file": "data/intel_scans.csv"},
-        "tuc_lecture_hall": {
-            "pairs.file": "data/tuc_lecture_hall_loops.csv",
-            "truth.file": "data/tuc_lecture_hall_gt.csv",
-        },
-    }.get(config, {})
-    named = [f"recording.table.{key}={folder / path}" for key, path in parts.items()]
-    relations = ["score.relations=null"] if config == "intel_laser" else []
-    return [f"recording.file={folder / file}", *named, *relations]
-
-
 def _measure_wheels(name: str, folder: Path) -> _Record:
-    config = load_config(RECORDS[name][0], _assignments(name, folder))
+    packaged, file = RECORDS[name]
+    config = load_config(packaged, [f"recording.file={folder / file}"])
     with open_source(config) as source:
         log = load_into_memory(source)
     half = log.length // 2
