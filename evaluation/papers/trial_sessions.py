@@ -84,21 +84,15 @@ def run_session(config: RunConfig, log: InMemorySource, session: Session | None 
         session: at its start; None: that of `start_session`.
     """
     session = session or start_session(config, log)
-    steps = list(session.replay(observation_of(sample) for sample in log))
-    place = np.array([int(step.estimate.place) for step in steps])
-    nodes = session.map.graph().nodes
+    steps, map = list(session.replay(observation_of(sample) for sample in log)), session.map
+    place, live = np.array([int(step.estimate.place) for step in steps]), [step.pose for step in steps]
+    nodes = map.graph().nodes
     rows = (nodes[k] for k in range(len(nodes)))
     node = np.array([[row["x"], row["y"], row["heading"]] for row in rows]).reshape(-1, 3)
-    return SessionResult(
-        truth=np.asarray(log.truth),
-        odometry=integrate(log.motion[:, :3]),
-        trajectory=session.map.trajectory(),
-        place=np.where(place < len(node), place, -1),
-        node=node,
-        closures=session.map.closures(),
-        live=np.array([step.pose for step in steps]),
-        piece=session.map.pieces(),
-    )
+    truth, odometry = np.asarray(log.truth), integrate(log.motion[:, :3])
+    trajectory, place = map.trajectory(), np.where(place < len(node), place, -1)
+    closures, piece = map.closures(), map.pieces()
+    return SessionResult(truth, odometry, trajectory, place, node, closures, np.array(live), piece)
 
 
 def start_session(config: RunConfig, log: InMemorySource) -> Session:
@@ -214,13 +208,11 @@ def closure_claims(map: Map, truth: np.ndarray) -> ClosureClaims:
     )
     later, earlier = truth[step], truth[match]
     angle = map.feedback().angle if rows else 0.0
-    return ClosureClaims(
-        sequence=sequence,
-        accepted=np.array([row["verdict"] == "accepted" for row in rows], bool),
-        distance=np.hypot(*(later - earlier)[:, :2].T),
-        turn=np.abs(wrap(later[:, 2] - earlier[:, 2] + shift * angle)),
-        log_odds=np.array([float(row["log_odds"]) for row in rows], float),
-    )
+    accepted = np.array([row["verdict"] == "accepted" for row in rows], bool)
+    distance = np.hypot(*(later - earlier)[:, :2].T)
+    turn = np.abs(wrap(later[:, 2] - earlier[:, 2] + shift * angle))
+    odds = np.array([float(row["log_odds"]) for row in rows], float)
+    return ClosureClaims(sequence, accepted, distance, turn, odds)
 
 
 class ArenaSession(NamedTuple):

@@ -29,12 +29,8 @@ from ratslam.recall.filter import BASIN
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap
 
-NETWORK, FINER, EXACT, MANY = (
-    "network",
-    "network, cells of half the side",
-    "exact",
-    f"{PARTICLES:,} particles",
-)
+NETWORK, FINER = "network", "network, cells of half the side"
+EXACT, MANY = "exact", f"{PARTICLES:,} particles"
 CONTROL = "additive injection (control)"
 COLOURS = {
     EXACT: style.INK, MANY: style.GREEN, NETWORK: style.BLUE, FINER: style.SKY, CONTROL: style.VERMILLION,
@@ -232,12 +228,8 @@ def measure_rooms(task: Task, sessions: int = 3) -> _Rooms:
     found = {name: np.array(each) for name, each in rows.items()}
     evident = np.cumsum(np.abs(found[EXACT][:, 0] - 0.5) > SIGN, axis=1) > 0
     seeds = range(task.first, task.first + sessions)
-    closures = [
-        list(
-            run_tasks(partial(worlds.room_closures, difference=DIFFERENCE, alike=alike), seeds, task.workers)
-        )
-        for alike in (True, False)
-    ]
+    kinds = (partial(worlds.room_closures, difference=DIFFERENCE, alike=alike) for alike in (True, False))
+    closures = [list(run_tasks(kind, seeds, task.workers)) for kind in kinds]
     return found, evident, closures
 
 
@@ -272,16 +264,9 @@ def _table_rooms(result: _Rooms) -> list[str]:
         before, after = np.abs(share[early] - 0.5), share[:, -1]
         decided = (np.abs(share - 0.5) > DECIDED - 0.5) & early
         apart = np.abs(share - found[EXACT][:, 0]).max()
+        first = f"{before.max():.3f}", f"{packet[early].max():.3f}", decided.any(axis=1).sum()
         ends = np.median(after), after.min(), np.median(room[:, -1]), apart
-        rows.append(
-            [
-                name,
-                f"{before.max():.3f}",
-                f"{packet[early].max():.3f}",
-                decided.any(axis=1).sum(),
-                *(f"{each:.3f}" for each in ends),
-            ]
-        )
+        rows.append([name, *first, *(f"{each:.3f}" for each in ends)])
     alike, unlike = (np.array(each, int).reshape(-1, 3).sum(axis=0).tolist() for each in closures)
     below = [
         f"{len(closures[0])} sessions of the whole product with given place ids. Until the first"

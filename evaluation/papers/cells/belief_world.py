@@ -288,13 +288,9 @@ def transition(poses: np.ndarray, motion: np.ndarray, cell: float) -> np.ndarray
     """
     turned = poses[:, 2] - motion[2]
     cosine, sine = np.cos(turned), np.sin(turned)
-    before = np.column_stack(  # where the robot was if it is now at each view cell
-        [
-            poses[:, 0] - cosine * motion[0] + sine * motion[1],
-            poses[:, 1] - sine * motion[0] - cosine * motion[1],
-            turned,
-        ]
-    )
+    x = poses[:, 0] - cosine * motion[0] + sine * motion[1]
+    y = poses[:, 1] - sine * motion[0] - cosine * motion[1]
+    before = np.column_stack([x, y, turned])  # where the robot was if it is now at each view cell
     sides = np.array([CELLS.cell_size, CELLS.cell_size, 2 * np.pi / CELLS.cells_heading])
     if cell:
         poses, before = (np.round(each / (cell * sides)) * cell * sides for each in (poses, before))

@@ -9,6 +9,7 @@ maps of all cells are therefore compared as they are and after the best turn and
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -205,26 +206,16 @@ def _table_boxes(result: _Boxes) -> list[str]:
         means = [_mean(fits[kind, pair][0][name]) for _, fits, _ in sessions]
         return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
 
+    whole = "far above the control: the sheet turns and shifts as a whole"
     figures = (
         ("A with A", "no shift", "high", "still"),
         ("A with B", "no shift", "about 0: the sheet has turned and shifted", "still"),
-        (
-            "A with B",
-            "best common turn and shift",
-            "far above the control: the sheet turns and shifts as a whole",
-            "best",
-        ),
+        ("A with B", "best common turn and shift", whole, "best"),
     )
-    rows = [
-        [
-            f"{kind}: {pair}, {how}",
-            goal,
-            spread(kind, pair, name),
-            f"{spread(kind, pair, f'shuffled {name}')} shuffled identities",
-        ]
-        for kind in KINDS
-        for pair, how, goal, name in figures
-    ]
+    rows = []
+    for kind, (pair, how, goal, name) in product(KINDS, figures):
+        control = f"{spread(kind, pair, f'shuffled {name}')} shuffled identities"
+        rows.append([f"{kind}: {pair}, {how}", goal, spread(kind, pair, name), control])
     found = ", ".join(f"{np.degrees(wrap(fits['columns', 'A with B'][1])):.0f}" for _, fits, _ in sessions)
     down = ", ".join(f"{np.degrees(turn):.0f}" for _, _, turn in sessions)
     rows.append(["common turn, degrees", "that of setting down", found, f"{down} set down"])

@@ -137,14 +137,11 @@ def _table_networks(result: tuple[str, Times]) -> list[str]:
         "networks", "sets measured", "us a step and set", "wall us", "1,000 sets x 30,000 steps, min",
         "wall min", "goal min", "memory MB",
     )  # fmt: skip
-    return table_lines(
-        [note],
-        columns,
-        (
-            [name, sets, *(f"{time:.1f}" for time in times), goal, f"{memory:.0f}"]
-            for (name, goal), (sets, *times, memory) in zip(GOALS.items(), rows, strict=True)
-        ),
+    cells = (
+        [name, sets, *(f"{time:.1f}" for time in times), goal, f"{memory:.0f}"]
+        for (name, goal), (sets, *times, memory) in zip(GOALS.items(), rows, strict=True)
     )
+    return table_lines([note], columns, cells)
 
 
 NETWORKS = Figure(

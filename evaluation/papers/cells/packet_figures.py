@@ -136,14 +136,9 @@ def _errors_of(seed: int, times: tuple[int, ...]) -> tuple[np.ndarray, np.ndarra
 
 
 def _course(seed: int, seconds: int) -> StudyCourse:
-    config = rat_config(
-        f"rat_simulation.seconds={seconds + 1}",
-        f"rat_simulation.rate_hz={RATE}",
-        f"rat_simulation.seed={seed}",
-        "rat_simulation.walk={}",
-        "rat_simulation.odometry={speed_white: 0.0, heading_white: 0.0}",
-        "rat_simulation.views.every=1000",
-    )
+    exact = "odometry={speed_white: 0.0, heading_white: 0.0}"
+    rat = f"seconds={seconds + 1}", f"rate_hz={RATE}", f"seed={seed}", "walk={}", exact, "views.every=1000"
+    config = rat_config(*(f"rat_simulation.{setting}" for setting in rat))
     return read_course(config, round((seconds + 1) * RATE), False, 2, (0,), seed)
 
 

@@ -48,14 +48,8 @@ DARK = {"dark": True}
 EDGES = np.array([0.0, 1.0])
 """Of the box, m."""
 COLUMNS = (
-    "cues",
-    "turn deg",
-    "heading of packet deg",
-    "place of packet deg",
-    "cells deg",
-    "gain",
-    "expected",
-)
+    "cues", "turn deg", "heading of packet deg", "place of packet deg", "cells deg", "gain", "expected",
+)  # fmt: skip
 
 
 SCHEDULE = (90.0, 110.0, 140.0)
@@ -77,15 +71,8 @@ heading at each step."""
 def measure_rotation(task: Task, schedule: _Schedule = SCHEDULE) -> _Rotations:
     """The rotations of all conditions and seeds."""
     turned_at, _, end = schedule
-    sessions = RatSessions(
-        rat_config(
-            f"rat_simulation.rate_hz={RATE}",
-            "rat_simulation.views.every=1",
-            "rat_simulation.walk={}",
-            "session.reserve=256",
-            f"cells.chosen={CELLS}",
-        )
-    )
+    rat = f"rat_simulation.rate_hz={RATE}", "rat_simulation.views.every=1", "rat_simulation.walk={}"
+    sessions = RatSessions(rat_config(*rat, "session.reserve=256", f"cells.chosen={CELLS}"))
     found, courses = [], []
     for _, degrees, phase in CONDITIONS:
         phases = [{"start": turned_at, **phase}] if phase else []

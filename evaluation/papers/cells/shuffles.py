@@ -85,10 +85,8 @@ def _shuffle_table(result: tuple[str, list[_Row]]) -> list[str]:
             f"{100 * each:.1f} %" for each in (cells.share, cells.low, cells.high, cells.tied, true_share)
         )
         within = "yes" if cells.low <= cells.share <= cells.high else "**no**"
-        means = f"{cells.shuffled_mean:.3g}", f"{true_mean:.3g}"
-        rows.append(
-            [way, score, cells.cells, share, f"{low} - {high}", within, tied, means[0], true, means[1]]
-        )
+        shuffled = cells.cells, share, f"{low} - {high}", within, tied, f"{cells.shuffled_mean:.3g}"
+        rows.append([way, score, *shuffled, true, f"{true_mean:.3g}"])
     return table_lines([note], COLUMNS, rows)
 
 

@@ -191,14 +191,10 @@ def _draw_torus(result: _Torus, png: Path) -> None:
         lags = autocorrelogram(shown)
         x, y = box.size
         reach_y, reach_x = (box.bin * side / 2 for side in lags.shape[1:])
+        reach = -reach_x, reach_x, -reach_y, reach_y
         for name, images, extent, colours in (
             (f"rates, box {_ratio(box, torus)} of the torus", rates, (0, x, 0, y), ("viridis", 0, 1)),
-            (
-                "autocorrelograms over lags of x and y (m)",
-                lags,
-                (-reach_x, reach_x, -reach_y, reach_y),
-                ("RdBu_r", -1, 1),
-            ),
+            ("autocorrelograms over lags of x and y (m)", lags, reach, ("RdBu_r", -1, 1)),
         ):
             top -= HEAD
             figure.text(style.LEFT / style.WIDTH, (top + 0.08) / height, name, fontsize=9, color=style.INK)

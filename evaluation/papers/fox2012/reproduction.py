@@ -189,12 +189,10 @@ def _render_results(protocol: _Protocol, rows: Sequence[ResultRow], sets: int) -
     lines += [_LEGEND, ""]
     if set(PAPERS) <= set(protocol.mappers) and done > 1:
         for method in METHODS:
-            scores = [
-                occupancy_score.pool_grids(
-                    [row.session.score for row in rows if row.key[1:] == (method, mapper, FILTERED)], mapper
-                )
-                for mapper in protocol.mappers
-            ]
+            scores = []
+            for mapper in protocol.mappers:
+                found = [row.session.score for row in rows if row.key[1:] == (method, mapper, FILTERED)]
+                scores.append(occupancy_score.pool_grids(found, mapper))
             lines += [f"{method.capitalize()}:", occupancy_score.render_grid_scores(scores), ""]
             lines += [*render_rankings(method, rows), ""]
     return "\n".join([*lines, protocol.note])

@@ -401,19 +401,15 @@ def _goal_lines(found: Sequence[Measured]) -> list[str]:
 def _draw_goals(found: Sequence[Measured], png: Path) -> None:
     """Draws the drives of one maze, and how far from the goals all of them ended."""
     free = [drive for one in found for drive in one.shown["free"]]
-    draw_panels(
-        png,
-        "Driving to goals on a map of touch",
-        f"One map, then goal after goal: reached {count([drive.reached for drive in free])}.",
-        ("distance from the goal at the end, m", ""),
-        dots={
-            "whiskers": [drive.error for drive in free if drive.said_reached],
-            "odometry": [drive.reckoned for drive in free],
-            "exact arm": [drive.by_arm for drive in free],
-        },
-        limits={"right": RIGHT.distance},
-        paths=found[0].shown["paths"],
-    )
+    title = "Driving to goals on a map of touch"
+    line = f"One map, then goal after goal: reached {count([drive.reached for drive in free])}."
+    names, limits = ("distance from the goal at the end, m", ""), {"right": RIGHT.distance}
+    dots = {
+        "whiskers": [drive.error for drive in free if drive.said_reached],
+        "odometry": [drive.reckoned for drive in free],
+        "exact arm": [drive.by_arm for drive in free],
+    }
+    draw_panels(png, title, line, names, dots=dots, limits=limits, paths=found[0].shown["paths"])
 
 
 GOALS = Figure("Drive to goals on a map", _measure_goals, _goal_lines, _draw_goals, 1)

@@ -182,39 +182,29 @@ def _ten_lines(found: Sequence[Measured]) -> list[str]:
 def _draw_overlap(found: Sequence[Measured], png: Path) -> None:
     """Draws one pair of sessions, joined if there is one, and the Energy Metric of all."""
     one = next((each for each in found if each.shown["joined"]), found[0])
-    draw_panels(
-        png,
-        "Two sessions of one maze, merged",
-        f"Joined rightly: {count(~column(found, 'not_joined'))}.",
-        ("Energy Metric, m² + rad²", ""),
-        dots={"merged": column(found, "em_union"), "one session": column(found, "em_alone")},
-        paths=one.shown["paths"],
-    )
+    line = f"Joined rightly: {count(~column(found, 'not_joined'))}."
+    title, names = "Two sessions of one maze, merged", ("Energy Metric, m² + rad²", "")
+    dots = {"merged": column(found, "em_union"), "one session": column(found, "em_alone")}
+    draw_panels(png, title, line, names, dots=dots, paths=one.shown["paths"])
 
 
 def _draw_different(found: Sequence[Measured], png: Path) -> None:
     """Draws the shares of pairs that were joined."""
     different, same = column(found, "mazes_joined"), ~column(found, "maze_not_joined")
-    draw_panels(
-        png,
-        "Sessions of two mazes",
-        f"Joined: {count(different)} of two mazes, {count(same)} of one.",
-        ("pairs that were joined, %", ""),
-        dots={"two mazes": [100 * different.mean()], "one maze": [100 * same.mean()]},
-    )
+    line = f"Joined: {count(different)} of two mazes, {count(same)} of one."
+    dots = {"two mazes": [100 * different.mean()], "one maze": [100 * same.mean()]}
+    draw_panels(png, "Sessions of two mazes", line, ("pairs that were joined, %", ""), dots=dots)
 
 
 def _draw_ten(found: Sequence[Measured], png: Path) -> None:
     """Draws keyframes and Energy Metric over the sessions."""
     growth, frames = (spread(column(found, name)) for name in ("em_growth", "frames_growth"))
-    draw_panels(
-        png,
-        "Ten sessions of one maze, merged one by one",
-        f"After ten, over one, median (worst): EM {growth}, keyframes {frames}.",
-        ("over that of one session", "sessions merged"),
-        curves={"Energy Metric": column(found, "union"), "keyframes": column(found, "frames")},
-        limits={"goal, Energy Metric": GROWTH, "goal, keyframes": FRAMES},
-    )
+    title = "Ten sessions of one maze, merged one by one"
+    line = f"After ten, over one, median (worst): EM {growth}, keyframes {frames}."
+    names = "over that of one session", "sessions merged"
+    curves = {"Energy Metric": column(found, "union"), "keyframes": column(found, "frames")}
+    limits = {"goal, Energy Metric": GROWTH, "goal, keyframes": FRAMES}
+    draw_panels(png, title, line, names, curves=curves, limits=limits)
 
 
 def _merge(task: MapTask, *maps: StoredMap) -> MapArrays:
@@ -331,17 +321,13 @@ def _draw_halves(found: Sequence[Measured], png: Path) -> None:
     most = max(found, key=lambda each: each.record["found"]).shown
     errors = {shown["name"]: shown["error"] for _, shown in found}
     revisits, off = (" and ".join(f"{each.record[name]:.1%}" for each in found) for name in ("found", "off"))
-    draw_panels(
-        png,
-        "Buildings, each recording in two halves",
-        f"Found at {revisits} of the revisits; off by 2 m or 30 degrees at {off} of the found steps.",
-        ("error while found, m", "time in the second half, %"),
-        curves={
-            name: [error[np.linspace(0, len(error) - 1, 100).astype(int)]] for name, error in errors.items()
-        },
-        limits={"wrong": metrics.BUILDING.distance},
-        paths=PathPanel(f"{most['name']}: the second half in the map of the first", None, most["paths"]),
-    )
+    title = "Buildings, each recording in two halves"
+    line = f"Found at {revisits} of the revisits; off by 2 m or 30 degrees at {off} of the found steps."
+    names = "error while found, m", "time in the second half, %"
+    limits = {"wrong": metrics.BUILDING.distance}
+    curves = {name: [each[np.linspace(0, len(each) - 1, 100).astype(int)]] for name, each in errors.items()}
+    paths = PathPanel(f"{most['name']}: the second half in the map of the first", None, most["paths"])
+    draw_panels(png, title, line, names, curves=curves, limits=limits, paths=paths)
 
 
 HALVES = Figure("Buildings in two halves", _measure_halves, _halves_lines, _draw_halves, RECORDINGS)

@@ -351,13 +351,8 @@ def _sweep_job(job: _TrialJob) -> list[ResultRow]:
     places = sweep_thresholds(config, log, np.array(protocols.SWEPT))[0].place
     for threshold, place in zip(protocols.SWEPT, places, strict=True):
         metric = experience_metric(place, np.asarray(log.truth), config.score.experience_metric)
-        values = {
-            "threshold": threshold,
-            "arr": metric.arr,
-            "arcr": metric.arcr,
-            "arcr_chain_free": metric.arcr_chain_free,
-            "relocalisations": metric.relocalisations,
-        }
+        names = "arr", "arcr", "arcr_chain_free", "relocalisations"
+        values = {"threshold": threshold} | {name: getattr(metric, name) for name in names}
         rows.append(ResultRow((*job.key[:2], "sweep"), job.number, job.seed, values))
     return rows
 

@@ -50,9 +50,12 @@ _RECOVERY_LIMIT = 45
 MAIN: dict[str, Any] = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}}}
 _ROUGH = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
 _MAX_ANGLE = {"image": {"transform": "max_angle"}}
-KIDNAPS = {"kidnaps": {"count": 8, "ahead": 45.0}}
-EXPLORATION = {"path": {"explore": 1500}}
+KIDNAPS, _KIDNAPS_24 = ({"kidnaps": {"count": count, "ahead": 45.0}} for count in (8, 24))
+_CARRIED = {"may_be_carried": True}
+EXPLORATION, _LONG = {"path": {"explore": 1500}}, MAIN | {"path": {"explore": 5000}}
+_OPEN_ARENA, _TREE = (MAIN | EXPLORATION | {"maze": maze} for maze in ({"share": 0.08}, {"kind": "tree"}))
 NOISE = OdometryConfig()
+_NOISE_X_2 = {"length": 2 * NOISE.length, "heading": 2 * NOISE.heading}
 _OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
@@ -86,30 +89,12 @@ ROWS = {
     "white": TouchRow("white odometry noise", {"odometry": {"noise": "white"}}, sessions=20),
     "telescoping": TouchRow("telescoping noise", {"odometry": {"noise": "telescoping"}}),
     "exploration": TouchRow("free exploration, 1500 whisks", EXPLORATION, sessions=40),
-    "open arena": TouchRow(
-        "open arena, 8 % of the walls, free exploration",
-        MAIN | EXPLORATION | {"maze": {"share": 0.08}},
-        sessions=20,
-    ),
-    "tree": TouchRow(
-        "maze without loops, free exploration", MAIN | EXPLORATION | {"maze": {"kind": "tree"}}, sessions=20
-    ),
-    "noise x 2": TouchRow(
-        "odometry noise x 2",
-        MAIN | {"odometry": {"length": 2 * NOISE.length, "heading": 2 * NOISE.heading}},
-        sessions=20,
-    ),
+    "open arena": TouchRow("open arena, 8 % of the walls, free exploration", _OPEN_ARENA, sessions=20),
+    "tree": TouchRow("maze without loops, free exploration", _TREE, sessions=20),
+    "noise x 2": TouchRow("odometry noise x 2", MAIN | {"odometry": _NOISE_X_2}, sessions=20),
     "exploration, 3000": TouchRow("free exploration, 3000 whisks", {"path": {"explore": 3000}}),
-    "exploration, 5000": TouchRow(
-        "free exploration, 5000 whisks", MAIN | {"path": {"explore": 5000}}, sessions=5
-    ),
-    "kidnaps, 5000": TouchRow(
-        "5000 whisks with 24 kidnaps",
-        MAIN | {"path": {"explore": 5000}, "kidnaps": {"count": 24, "ahead": 45.0}},
-        {},
-        {"may_be_carried": True},
-        sessions=5,
-    ),
+    "exploration, 5000": TouchRow("free exploration, 5000 whisks", _LONG, sessions=5),
+    "kidnaps, 5000": TouchRow("5000 whisks with 24 kidnaps", _LONG | _KIDNAPS_24, {}, _CARRIED, sessions=5),
     "new ground": TouchRow("3000 whisks that enter no cell twice", MAIN, sessions=5, new_ground=3000),
     "5 x 5": TouchRow("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
     "12 x 8": TouchRow("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
@@ -131,7 +116,7 @@ ROWS = {
         "main from raw samples with drift, colour and creep",
         MAIN | {"mechanics": {"baseline": HALL_BASELINE.model_dump()}},
     ),
-    "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, {"may_be_carried": True}),
+    "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, _CARRIED),
     "control: shuffled": TouchRow("control: shuffled images", MAIN),
     "control: no image": TouchRow("control: no images", MAIN),
     "control: other maze": TouchRow("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),

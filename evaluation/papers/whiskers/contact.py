@@ -245,23 +245,13 @@ def _measure_contacts(data: Path) -> _ContactResult:
     away = np.abs(signal - free.mean).max(axis=0) / free.noise
     never = (away < CONTACT_SDS).all(axis=1)
     contact = touch == contact_stream.Touch.CONTACT
+    bent = (touch == contact_stream.Touch.BENT).any(axis=0)
     tripled = {name: _score_tripled(config, free, signal, contact, name) for name in RULES}
-    return _ContactResult(
-        config=config,
-        record=record,
-        free=free,
-        away=away.max(axis=1),
-        contact=contact,
-        bent=(touch == contact_stream.Touch.BENT).any(axis=0),
-        fixed=fixed,
-        baseline=baseline,
-        never=never,
-        streams={
-            "the record, each baseline times 3": tripled,
-            **_score_hours(config, free, signal, never, dirty),
-        },
-        marks=_mark_lines(dict(zip(RULES, (contact, fixed), strict=True)), ~never & ~dirty),
-    )
+    hours = _score_hours(config, free, signal, never, dirty)
+    streams = {"the record, each baseline times 3": tripled, **hours}
+    marks = _mark_lines(dict(zip(RULES, (contact, fixed), strict=True)), ~never & ~dirty)
+    away = away.max(axis=1)
+    return _ContactResult(config, record, free, away, contact, bent, fixed, baseline, never, streams, marks)
 
 
 def _follow(config: ReachConfig, free: FreeBaseline, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

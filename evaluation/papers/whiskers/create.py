@@ -162,15 +162,10 @@ def _measure_create(folder: Path) -> CreateResult:
     # The estimates after the rigid motions that bring them nearest to the truth.
     estimates = {"odometry": odometry, "map": mapped[known]}
     paths = {name: compose(align(poses, truth), poses) for name, poses in estimates.items()}
-    return CreateResult(
-        variants=variants,
-        true_turns=_true_turns_ate(odometry, truth),
-        drift=float(np.ptp(error)),
-        latency=float(np.median(depth["latency"])),
-        paths=paths | {"truth": truth},
-        walls=segments,
-        distances=distances,
-    )
+    paths["truth"] = truth
+    true_turns = _true_turns_ate(odometry, truth)
+    drift, latency = float(np.ptp(error)), float(np.median(depth["latency"]))
+    return CreateResult(variants, true_turns, drift, latency, paths, segments, distances)
 
 
 def _table_create(result: CreateResult) -> list[str]:

@@ -122,13 +122,10 @@ def free_figures(record: np.ndarray, rate: float) -> _FreeFigures:
     grown = (2 * _mean_change(record, span)[0] / noise - 2).mean() * rate / span[0]
     level = uniform_filter1d(record, BLOCK, axis=0)[BLOCK // 2 : -BLOCK // 2] / np.sqrt(noise)
     extent, spans = np.ptp(level, axis=0), SPANS[: np.searchsorted(SPANS, len(record) // 2)]
-    return _FreeFigures(
-        correlation=correlation,
-        change=np.sqrt(np.mean(2 * _mean_change(record, spans) / noise, axis=1)),
-        time=float(-1 / (rate * np.log(correlation[0]))) if correlation[0] > COLOURED else None,
-        drift=float(np.sqrt(max(grown, 0.0))),
-        range=(float(extent.min()), float(extent.max())),
-    )
+    change = np.sqrt(np.mean(2 * _mean_change(record, spans) / noise, axis=1))
+    time = float(-1 / (rate * np.log(correlation[0]))) if correlation[0] > COLOURED else None
+    least, largest = float(extent.min()), float(extent.max())
+    return _FreeFigures(correlation, change, time, float(np.sqrt(max(grown, 0.0))), (least, largest))
 
 
 def creep_figures(signal: np.ndarray, time: float | None) -> Creep:
