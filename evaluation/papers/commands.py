@@ -206,11 +206,10 @@ def _maps(arguments: argparse.Namespace) -> int:
 
     names = select_rows(arguments.rows, MAPS)
     first, sessions, workers = arguments.first, arguments.sessions, arguments.workers
-    for line in reproduce_maps(
-        names, Methods(), arguments.output, first, sessions, workers, arguments.against
-    ):
+    output, against = arguments.output, arguments.against
+    for line in reproduce_maps(names, Methods(), output, first, sessions, workers, against):
         print(line, flush=True)
-    print(f"wrote {arguments.output / 'maps.md'} and {arguments.output / 'maps.csv'}")
+    print(f"wrote {output / 'maps.md'} and {output / 'maps.csv'}")
     return 0
 
 
@@ -311,8 +310,7 @@ def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
         from evaluation.papers.tables import touch_table as touch
 
         rows = select_rows(arguments.rows, touch.ROWS, touch.DEFAULT_ROWS)
-        files = arguments.output, arguments.against
-        first, sessions = arguments.first, arguments.sessions
+        first, sessions, files = arguments.first, arguments.sessions, (arguments.output, arguments.against)
         return touch.touch_table(rows, first, sessions, arguments.workers, arguments.backend, files)
     if name == "grid":
         from evaluation.papers.tables import grid_table as grid
@@ -327,8 +325,7 @@ def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
 
         copies, workers = arguments.copies, arguments.workers
         if name == "laser":
-            rows = select_rows(arguments.rows, buildings.ROWS)
-            return buildings.laser_table(rows, copies, workers)
+            return buildings.laser_table(select_rows(arguments.rows, buildings.ROWS), copies, workers)
         files = arguments.output, arguments.against
         return buildings.buildings_table(buildings.choose_rows(arguments.rows), copies, workers, files=files)
     if name == "health":

@@ -97,7 +97,7 @@ def run_session(config: RunConfig, log: InMemorySource, session: Session | None 
 
 def start_session(config: RunConfig, log: InMemorySource) -> Session:
     """A session at its start, for a configuration completed by its source; the next call takes it back."""
-    session = _compiled(*_kind(config, log))
+    session = _compiled(_kind(config, log))
     session.restart(config.session.seed)
     return session
 
@@ -110,7 +110,7 @@ def new_session(
     Args:
         change: is done to the backend before.
     """
-    session = _build(*_kind(config, log), change)
+    session = _build(_kind(config, log), change)
     session.restart(config.session.seed)
     return session
 
@@ -120,22 +120,18 @@ def capacity_for(steps: int) -> int:
     return capacity_at(max(steps, 1) - 1)
 
 
-def _kind(
-    config: RunConfig, log: InMemorySource
-) -> tuple[str, Settings, Precision, tuple[int, int, int], int]:
+_Kind = tuple[str, Settings, Precision, tuple[int, int, int], int]
+"""What sessions of one kernel share: name and settings of the method, precision, shape of views, rows."""
+
+
+def _kind(config: RunConfig, log: InMemorySource) -> _Kind:
     method = backend_settings(config.backend, config)
     reserve = max(capacity_for(log.length), config.session.reserve)
     return config.backend, method, config.session.precision, log.view_shape, reserve
 
 
-def _build(
-    name: str,
-    method: Settings,
-    precision: Precision,
-    shape: tuple[int, int, int],
-    reserve: int,
-    change: Callable[[Backend], None] | None = None,
-) -> Session:
+def _build(kind: _Kind, change: Callable[[Backend], None] | None = None) -> Session:
+    name, method, precision, shape, reserve = kind
     prepare_precision(precision)
     backend = build(name, method, Sensors(shape), precision)
     if change is not None:

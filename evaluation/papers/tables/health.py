@@ -21,7 +21,7 @@ from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.statistics import auc
 from evaluation.papers.tables.buildings import HARM_FACTOR, HARM_MARGIN
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.tables.recordings import Recording, real_recordings
+from evaluation.papers.tables.recordings import real_recordings
 from evaluation.papers.tables.spoilt_maps import spoilt_maps
 from evaluation.papers.tables.touch_table import MAIN, NOISE, ROWS, touch_config
 from evaluation.papers.trial_sessions import known_ate, run_recording
@@ -30,7 +30,7 @@ from evaluation.studies.perturbation import miscalibrate
 from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import DOUBTED, INTERCEPT, WEIGHTS, health_features
-from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.run_config import RunConfig, load_config
 
 FIRST_MAZE = 31000
 RIDGE = 2.0
@@ -118,8 +118,7 @@ def task_config(row: str, number: int) -> tuple[RunConfig, bool]:
         return touch_config(FIRST_MAZE + number, number, TOUCH[row], session={"reserve": 2048}), True
     config, file = REAL[row]
     settings = (f"recording.file={(real_recordings() or Path()).absolute() / file}",) if file else ()
-    recording = Recording(row, config, settings, real=True)
-    return recording.configuration("session.reserve=1024"), False
+    return load_config(config, [*settings, "session.reserve=1024"]), False
 
 
 def fit_weights(maps: np.ndarray) -> np.ndarray:
