@@ -138,11 +138,11 @@ def exact(world: World, cell: float = 0.0) -> np.ndarray:
     return np.array(rows)
 
 
-def particles(world: World, seed: int, count: int = PARTICLES) -> np.ndarray:
-    """[T, N + 1] the same by particles, which are drawn anew after each update, one in each of `count` equal
-    shares of the mixture of their weighed predictions."""
+def particles(world: World, seed: int) -> np.ndarray:
+    """[T, N + 1] the same by particles, which are drawn anew after each update, one in each of `PARTICLES`
+    equal shares of the mixture of their weighed predictions."""
     random, state = stream(seed, "cells.belief_particles"), np.append(world.start, 1 - world.start.sum())
-    rows = []
+    rows, count = [], PARTICLES
     for k in range(len(world.motion)):
         drawn = np.searchsorted(np.cumsum(state), (np.arange(count) + random.random()) / count)
         held = np.bincount(np.minimum(drawn, len(state) - 1), minlength=len(state)) / count

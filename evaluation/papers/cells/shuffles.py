@@ -39,17 +39,14 @@ _Row = tuple[Way, str, Calibration, float, float]
 score."""
 
 
-def check_shuffles(
-    task: Task, cells: int = CELLS, shuffles: int = SHUFFLES, seconds: float = SECONDS
-) -> tuple[str, list[_Row]]:
+def check_shuffles(task: Task, shuffles: int = SHUFFLES, seconds: float = SECONDS) -> tuple[str, list[_Row]]:
     """Compares cells of a session with their shuffles, for every score and path; what is compared, as
     sentences, and the rows.
 
     Args:
-        task: its sessions are the cells of the calibration. cells: where the task does not say. shuffles: of
-            each cell. seconds: of the session.
+        task: its sessions are the cells of the calibration. shuffles: of each cell. seconds: of the session.
     """
-    cells = task.sessions or cells
+    cells = task.sessions or CELLS
     true_cells = min(cells, TRUE_CELLS)
     tasks = []
     for way in get_args(Way):

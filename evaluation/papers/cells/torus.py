@@ -261,7 +261,6 @@ def _draw_row(
     bar = style.add_axes(figure, left, bottom, BAR, tall)
     figure.colorbar(image, cax=bar, ticks=(low, high))
     label = "rate / peak" if low == 0 else "correlation"
-    bar.yaxis.set_label_position("right")
     bar.set_ylabel(label, fontsize=8, color=style.LABEL_GREY, labelpad=1)
 
 

@@ -8,7 +8,6 @@ another error of the wheels.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -28,6 +27,7 @@ from ratslam.runs.saved_map import describe_readings, read_map, write_map
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from robot.touch_source import observation_of, open_touch_source
+from tactile.base.files import write_atomically
 from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
 from tactile.base.types import Observation
@@ -176,8 +176,7 @@ def store_arena_map(arena: int, side: float, folder: Path) -> tuple[Path, MapSte
                 pass
             write_map(path, session, config, describe_readings(source), recording=source.digest)
         truth = np.array([sample.truth for sample in samples])
-        unfinished = beside.with_name(f".{os.getpid()}.npz")
-        np.savez(unfinished, trajectory=session.map.trajectory(), truth=truth)
-        unfinished.replace(beside)
+        poses = session.map.trajectory()
+        write_atomically(beside, lambda unfinished: np.savez(unfinished, trajectory=poses, truth=truth))
     with np.load(beside) as saved:
         return path, MapSteps.known(saved["trajectory"], saved["truth"])

@@ -9,6 +9,7 @@ import numpy as np
 from evaluation.metrics.exm import ExperienceMetric, creation_rows
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, GREY, INK, LINE_GREY, PURPLE, VERMILLION, YELLOW
+from evaluation.studies.metrics import ViewDifferences
 
 _SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
 """Colours of the compared series, in this order."""
@@ -152,34 +153,26 @@ def draw_curves(
     return style.add_legend(figure, panels[0])
 
 
-def draw_tuning(
-    edge: np.ndarray,
-    same: np.ndarray,
-    other: np.ndarray,
-    auc: float,
-    threshold: np.ndarray,
-    correct: np.ndarray,
-    incorrect: np.ndarray,
-    winner: float | None,
-) -> style.Figure:
+def draw_tuning(views: ViewDifferences, scores: np.ndarray, winner: float | None) -> style.Figure:
     """Draws histograms of view differences at the same and at different places, and results by threshold.
 
     Args:
-        edge: [B + 1] edges of the histograms. same, other: [B] numbers of pairs. auc: of their separation.
-        threshold, correct, incorrect: [G] thresholds and re-localisations. winner: chosen threshold, if any.
+        scores: [3, G] thresholds, correct and incorrect re-localisations. winner: chosen threshold, if any.
     """
+    threshold, correct, incorrect = scores
     taken = "no threshold meets the target" if winner is None else f"threshold {winner:g}"
-    line = f"AUC {auc:.3f}  ·  {taken}"
+    line = f"AUC {views.auc:.3f}  ·  {taken}"
     figure, (left, right) = _panels("Tuning of the classic matcher", line, ("", ""), 3.4)
-    for count, color, label in ((same, BLUE, "same place"), (other, VERMILLION, "different places")):
-        left.stairs(count / max(count.sum(), 1), edge, color=color, fill=True, alpha=0.45, label=label)
+    pairs = (views.same, BLUE, "same place"), (views.other, VERMILLION, "different places")
+    for count, color, label in pairs:
+        share = count / max(count.sum(), 1)
+        left.stairs(share, views.edge, color=color, fill=True, alpha=0.45, label=label)
     style.name_axes(left, "difference of two views", "share of pairs")
     right.plot(threshold, correct, "o-", ms=3, lw=1.0, color=GREEN, label="correct")
     right.plot(threshold, incorrect, "x-", ms=4, lw=1.0, color=PURPLE, label="incorrect")
     style.name_axes(right, "threshold", "re-localisations")
-    for axes in (left, right):
-        if winner is not None:
-            axes.axvline(winner, color=INK, lw=1.1, ls=_DOTS, label="chosen")
+    for axes in (left, right) if winner is not None else ():
+        axes.axvline(winner, color=INK, lw=1.1, ls=_DOTS, label="chosen")
     right.legend(frameon=False, fontsize=9, labelcolor=INK)
     return style.add_legend(figure, left)
 
