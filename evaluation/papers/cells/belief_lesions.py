@@ -349,11 +349,8 @@ def _run_size(row: str, task: tuple[_Network, int]) -> _Sized:
         assert backend.cell == CELL
         cells = PoseCellConfig(cells_xy=side, cell_size=size)
         backend.network = backend.network._replace(cells=cells, excite=backend.network.excite * unit)
-        lengths = {
-            "local_sd": backend.recall.local_sd * unit,
-            "local_heading_rate": backend.recall.local_heading_rate / unit,
-        }
-        backend.recall = backend.recall.model_copy(update=lengths)
+        sd, rate = backend.recall.local_sd * unit, backend.recall.local_heading_rate / unit
+        backend.recall = backend.recall.model_copy(update={"local_sd": sd, "local_heading_rate": rate})
 
     def start(config: RunConfig, log: InMemorySource) -> Session:
         sessions.append(new_session(config, log, change))

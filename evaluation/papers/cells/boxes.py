@@ -177,8 +177,7 @@ def _fit_session(recording: CellRecording, seconds: float, side: float, columns:
         ]
     fits = {
         (kind, pair): fit_maps(maps[kind][k], maps[kind][k + 1], recording.shape[2])
-        for kind in KINDS
-        for k, pair in enumerate(PAIRS)
+        for kind, (k, pair) in product(KINDS, enumerate(PAIRS))
     }
     after = int(np.flatnonzero(part == 2)[0])
     turn = wrap(recording.truth[after - 1, 2] - recording.truth[after, 2])
@@ -255,11 +254,8 @@ def _draw_boxes(result: _Boxes, png: Path) -> None:
         return joined[np.isfinite(joined)]
 
     pairs = {
-        title: {
-            "A with A": correlations("A with A", name),
-            "A with B": correlations("A with B", name),
-            "A with B, identities shuffled": correlations("A with B", f"shuffled {name}"),
-        }
+        title: {pair: correlations(pair, name) for pair in PAIRS}
+        | {"A with B, identities shuffled": correlations("A with B", f"shuffled {name}")}
         for title, name in (("as they are", "still"), ("after the best common turn and shift", "best"))
     }
     bins = round(torus / side * maps.shape[2])

@@ -199,7 +199,21 @@ def _draw_torus(result: _Torus, png: Path) -> None:
             top -= HEAD
             figure.text(style.LEFT / style.WIDTH, (top + 0.08) / height, name, fontsize=9, color=style.INK)
             top -= tall
-            _draw_row(figure, top, tall, images, extent, colours)
+            palette, low, high = colours
+            for column, values in enumerate(images):
+                axes = style.add_axes(figure, style.LEFT + column * (WIDE + GAP), top, WIDE, tall)
+                image = axes.imshow(values, origin="lower", extent=extent, cmap=palette, vmin=low, vmax=high)
+                axes.set(xticks=[round(extent[0], 1), round(extent[1], 1)], yticks=[])
+                axes.tick_params(labelsize=7, pad=1)
+                labels = axes.get_xticklabels()
+                labels[0].set_horizontalalignment("left")
+                labels[-1].set_horizontalalignment("right")
+                if column == 0:
+                    axes.set_yticks([round(extent[2], 1), round(extent[3], 1)])
+            bar = style.add_axes(figure, style.LEFT + len(images) * (WIDE + GAP), top, BAR, tall)
+            figure.colorbar(image, cax=bar, ticks=(low, high))
+            label = "rate / peak" if low == 0 else "correlation"
+            bar.set_ylabel(label, fontsize=8, color=style.LABEL_GREY, labelpad=1)
     axes = _draw_histograms(figure, scores, large.spacing, torus)
     style.add_legend(figure, axes, columns=2).savefig(png)
 
@@ -239,29 +253,6 @@ HEIGHT, LOW, HEAD = 1.6, 0.95, 0.42
 
 SCORES = np.linspace(-1.5, 1.5, 61).tolist()
 """Limits of the bins of lattice scores."""
-
-
-def _draw_row(
-    figure: style.Figure, bottom: float, tall: float, images: np.ndarray,
-    extent: tuple[float, float, float, float],
-    colours: tuple[str, float, float],
-) -> None:  # fmt: skip
-    name, low, high = colours
-    for column, values in enumerate(images):
-        axes = style.add_axes(figure, style.LEFT + column * (WIDE + GAP), bottom, WIDE, tall)
-        image = axes.imshow(values, origin="lower", extent=extent, cmap=name, vmin=low, vmax=high)
-        axes.set(xticks=[round(extent[0], 1), round(extent[1], 1)], yticks=[])
-        axes.tick_params(labelsize=7, pad=1)
-        labels = axes.get_xticklabels()
-        labels[0].set_horizontalalignment("left")
-        labels[-1].set_horizontalalignment("right")
-        if column == 0:
-            axes.set_yticks([round(extent[2], 1), round(extent[3], 1)])
-    left = style.LEFT + len(images) * (WIDE + GAP)
-    bar = style.add_axes(figure, left, bottom, BAR, tall)
-    figure.colorbar(image, cax=bar, ticks=(low, high))
-    label = "rate / peak" if low == 0 else "correlation"
-    bar.set_ylabel(label, fontsize=8, color=style.LABEL_GREY, labelpad=1)
 
 
 def _draw_histograms(

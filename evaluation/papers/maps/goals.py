@@ -360,12 +360,8 @@ def goal_figures(
     }
     gap = np.full((1, 2), np.nan)  # between the paths of two drives
     driven = np.concatenate([gap, *(np.concatenate([drive.path, gap]) for drive in free)])
-    paths = PathPanel(
-        "drives to goals, without a wall in the way",
-        maze,
-        {"map": mapped, "drives": driven},
-        [("goals", np.array([drive.goal for drive in free]).reshape(-1, 2))],
-    )
+    goals, ways = np.array([drive.goal for drive in free]).reshape(-1, 2), {"map": mapped, "drives": driven}
+    paths = PathPanel("drives to goals, without a wall in the way", maze, ways, [("goals", goals)])
     return Measured(figures, {"free": free, "walled": walled, "mapping": least, "paths": paths})
 
 

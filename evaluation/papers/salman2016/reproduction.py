@@ -16,14 +16,8 @@ from evaluation.metrics.energy_metric import energy, energy_all_pairs, successiv
 from evaluation.metrics.exm import experience_metric
 from evaluation.metrics.statistics import bootstrap
 from evaluation.metrics.trajectory import align
-from evaluation.papers.paper_sets import (
-    Paper,
-    ResultRow,
-    column,
-    count_sets,
-    run_with_progress,
-    sweep_thresholds,
-)
+from evaluation.papers import paper_sets
+from evaluation.papers.paper_sets import Paper, ResultRow, column, run_with_progress
 from evaluation.papers.salman2016 import paper_figures, protocols
 from evaluation.papers.salman2016.protocols import BY_MAZE, THRESHOLDS, Claim, Condition, Protocol
 from evaluation.papers.trial_sessions import Control, apply_control, collect_session, run_session
@@ -190,7 +184,7 @@ def _short(value: float, digits: int = 3) -> str:
 def _draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
     """The figure of a reproduction: metrics over all sets, or sessions of the first set."""
     title, first_only = f"{name}: {protocol.title}", name in ("fig2", "fig3", "fig5")
-    line = f"{protocol.source}  ·  {count_sets(rows, first_only)}"
+    line = f"{protocol.source}  ·  {paper_sets.count_sets(rows, first_only)}"
     first = [row for row in rows if row.session is not None]
     if name == "fig2":
         paths: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
@@ -348,7 +342,7 @@ def _sweep_job(job: _TrialJob) -> list[ResultRow]:
     """The Experience Metric of the classic method at the thresholds `SWEPT`, without maps."""
     config, log = collect_session(job.config)
     rows = []
-    places = sweep_thresholds(config, log, np.array(protocols.SWEPT))[0].place
+    places = paper_sets.sweep_thresholds(config, log, np.array(protocols.SWEPT))[0].place
     for threshold, place in zip(protocols.SWEPT, places, strict=True):
         metric = experience_metric(place, np.asarray(log.truth), config.score.experience_metric)
         names = "arr", "arcr", "arcr_chain_free", "relocalisations"

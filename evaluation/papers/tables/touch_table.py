@@ -247,19 +247,14 @@ def run_and_measure(
     change = int(CHANGE * log.length)
     across = (result.closures[:, 0] >= change) & (result.closures[:, 1] < change)
     later, earlier = true_closures.T
-    recovered = [min(later[(later >= k) & (earlier < k)] - k, default=log.length) for k in kidnaps]
-    return result, SessionFigures(
-        metrics._replace(
-            em_experiences=energy_all_pairs(snapped, truth).total,
-            arcr_chain_free=float(np.nan_to_num(metrics.arcr_chain_free)),
-        ),
-        revisits_closed=_share_of_revisits_closed(truth, true_closures),
-        em_live=energy_all_pairs(result.live, truth).total,
-        em_pieces=energy_within_pieces(result.trajectory, truth, result.piece).total,
-        unjoined=unjoined_share(result.piece),
-        across=int(across.sum()),
-        recovery=tuple(map(int, recovered)),
-    )
+    recovered = (min(later[(later >= k) & (earlier < k)] - k, default=log.length) for k in kidnaps)
+    em_experiences, em_live = (energy_all_pairs(path, truth).total for path in (snapped, result.live))
+    chain_free = float(np.nan_to_num(metrics.arcr_chain_free))
+    metrics = metrics._replace(em_experiences=em_experiences, arcr_chain_free=chain_free)
+    closed = _share_of_revisits_closed(truth, true_closures)
+    em_pieces = energy_within_pieces(result.trajectory, truth, result.piece).total
+    rest = unjoined_share(result.piece), int(across.sum()), tuple(map(int, recovered))
+    return result, SessionFigures(metrics, closed, em_live, em_pieces, *rest)
 
 
 def task_config(task: TouchTask) -> RunConfig:

@@ -33,8 +33,12 @@ RECORDS = {
 """Configuration and odometry of each record with truth."""
 CREATE, MAPPED = "real Create", ("Intel lab", "ACES")
 """The record that is drawn; those whose revisits are compared with the truth."""
-VALUES = {"length_scale": 1.0, "turn_scale": 1.0, "heading_bias": 0.0}
-"""The quantities of the table, and what is assumed."""
+VALUES = {
+    "length_scale": (1.0, "distance, true / measured"),
+    "turn_scale": (1.0, "turn, true / measured"),
+    "heading_bias": (0.0, "heading bias, rad/m"),
+}
+"""The quantities of the table: what is assumed, and the label of the axis."""
 
 
 _Record = tuple[list[WheelFit], list[tuple[np.ndarray, ...]], Rig | None]
@@ -146,10 +150,8 @@ def _draw(result: _Rigs, png: Path) -> None:
     title = "What a record tells of its rig"
     line = "Wheels against truth, half against half; noise of the whiskers of an arm in clutter"
     figure = style.new_figure(9.6, title, line)
-    for k, (key, assumed) in enumerate(VALUES.items()):
-        _draw_intervals(
-            style.add_axes(figure, 1.25 + 2.25 * k, 6.25, 1.95, 2.15), records, key, assumed, k == 0
-        )
+    for k, key in enumerate(VALUES):
+        _draw_intervals(style.add_axes(figure, 1.25 + 2.25 * k, 6.25, 1.95, 2.15), records, key, k == 0)
     fits, paths, _ = records[CREATE]
     for k, half in enumerate(("first half", "second half")):
         other = fits[2 - k].correction
@@ -162,9 +164,8 @@ def _draw(result: _Rigs, png: Path) -> None:
     figure.savefig(png)
 
 
-def _draw_intervals(
-    axes: style.Axes, records: dict[str, _Record], key: str, assumed: float, named: bool
-) -> None:
+def _draw_intervals(axes: style.Axes, records: dict[str, _Record], key: str, named: bool) -> None:
+    assumed, label = VALUES[key]
     axes.axvline(assumed, color=style.GREY, lw=1)
     colours = (style.INK, style.BLUE, style.VERMILLION)
     for row, (fits, *_) in enumerate(records.values()):
@@ -174,12 +175,7 @@ def _draw_intervals(
             axes.errorbar(value, at, xerr=2 * sd, fmt="o", ms=3, lw=1.2, color=colour)
     ticks = [-row for row in range(len(records))]
     axes.set_yticks(ticks, list(records) if named else [""] * len(ticks))
-    axes.set_xlabel(
-        {"length_scale": "distance, true / measured", "turn_scale": "turn, true / measured"}.get(
-            key, "heading bias, rad/m"
-        ),
-        color=style.LABEL_GREY, fontsize=9,
-    )  # fmt: skip
+    axes.set_xlabel(label, color=style.LABEL_GREY, fontsize=9)
     axes.grid(axis="x", color=style.LINE_GREY, lw=0.7)
     if named:
         for colour, word, at in zip(

@@ -174,11 +174,8 @@ def _draw(result: _Likeness, png: Path) -> None:
             # Shares of the pairs of two objects and of one that are taken for one, as the limit falls.
             truth = same[np.argsort(-score, kind="stable")]
             shown = np.linspace(0, len(truth) - 1, min(len(truth), 2000)).astype(int)
-            wrong, right = (
-                (np.cumsum(~truth) / (~truth).sum())[shown],
-                (np.cumsum(truth) / truth.sum())[shown],
-            )
-            axes[0].plot(wrong, right, style, color=color, label=f"{label}: {of}")
+            shares = [(np.cumsum(found) / found.sum())[shown] for found in (~truth, truth)]
+            axes[0].plot(*shares, style, color=color, label=f"{label}: {of}")
         # Mean probability of one object against the share of such pairs, in bins of equally many pairs.
         chance = _probabilities(odds, same)
         bins = np.array_split(np.argsort(chance, kind="stable"), BINS)

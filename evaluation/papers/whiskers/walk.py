@@ -181,11 +181,8 @@ def _draw(walks: list[_WalkResult], png: Path) -> None:
         for axis, (name, path) in zip(column, paths.items(), strict=True):
             aligned = compose(align(path[: walk.turned], walk.real.truth[: walk.turned]), path)
             axis.plot(*walk.real.truth[:, :2].T, color="0.75", lw=3, label="truth")
-            parts = (
-                (slice(walk.turned), "C0", "three circuits"),
-                (slice(walk.turned - 1, None), "C1", "fourth"),
-            )
-            for part, color, label in parts:
+            three, fourth = slice(walk.turned), slice(walk.turned - 1, None)
+            for part, color, label in ((three, "C0", "three circuits"), (fourth, "C1", "fourth")):
                 axis.plot(*aligned[part, :2].T, color=color, lw=1, label=label)
             error = energy_all_pairs(path, walk.real.truth).total
             axis.set(title=f"{name}, EM {error:.3f}", xticks=[], yticks=[])
