@@ -68,8 +68,8 @@ class VirtualArm:
         self._setup = HeadSetup(surroundings.head, plan.stream, plan.mechanics, plan.whisking)
         self._random = stream(plan.seed, "live.sensor")
         self._odometer = ArmOdometry(config)
+        self.poses: list[np.ndarray] = []
         self._remember()
-        self.poses = [self._pose()]
 
     def move(self, tcp: np.ndarray, speed: float | None = None) -> None:
         """Starts a straight move; it replaces the present one.
@@ -97,7 +97,6 @@ class VirtualArm:
             self._arm.step(self._dt)
             self.time += self._dt
             self._remember()
-            self.poses.append(self._pose())
         steps = np.array(self.poses[first:])
         steps[:, 2] = np.unwrap(steps[:, 2])
         path = HeadPath(np.linspace(begin, self.time, len(steps)), steps)
@@ -112,12 +111,10 @@ class VirtualArm:
         while True:
             yield self.whisk()
 
-    def _pose(self) -> np.ndarray:
-        return self._config.arm.placing.pose_from_tcp(np.array(self._arm.state.tcp))[0]
-
     def _remember(self) -> None:
         state = self._arm.state
         self._odometer.add(np.array([self.time]), np.array([state.tcp]), np.array([state.speed]))
+        self.poses.append(self._config.arm.placing.pose_from_tcp(np.array(state.tcp))[0])
 
 
 PAIRS, WALLS = 20, 5
@@ -368,9 +365,8 @@ def goal_figures(
 def _goal_lines(found: Sequence[Measured]) -> list[str]:
     free, walled = ([drive for one in found for drive in one.shown[name]] for name in ("free", "walled"))
     n, drives, done = len(free), free + walled, [one for one in free if one.said_reached]
-    ratio = np.array([one.length for one in done]).sum() / max(
-        np.array([one.shortest for one in done]).sum(), 1e-9
-    )
+    driven, shortest = np.array([(one.length, one.shortest) for one in done]).reshape(-1, 2).T
+    ratio = driven.sum() / max(shortest.sum(), 1e-9)
     return table(
         f"reached (truly within {RIGHT.distance:g} m) | {n} of {n} | {count([one.reached for one in free])}"
         f" | {count([one.reckoned <= RIGHT.distance for one in free])} by odometry alone,"

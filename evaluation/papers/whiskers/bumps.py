@@ -161,11 +161,9 @@ def _draw(result: BumpsResult, file: Path) -> None:
     )
     for x1, y1, x2, y2 in result.walls:
         axes.plot([x1, x2], [y1, y2], color=style.INK, lw=1.4, zorder=3)
-    for path, colour, name in (
-        (result.raw, style.GREEN, "odometry"),
-        (result.path, style.BLUE, "grid filter"),
-        (result.truth, style.VERMILLION, "truth"),
-    ):
+    paths = {"odometry": result.raw, "grid filter": result.path, "truth": result.truth}
+    colours = style.GREEN, style.BLUE, style.VERMILLION
+    for (name, path), colour in zip(paths.items(), colours, strict=True):
         axes.plot(*path[:, :2].T, color=colour, lw=1.1, label=name)
     axes.legend(frameon=False, fontsize=9, loc="upper left")
     axes.set(aspect="equal", xlim=(-4.4, 3.6), ylim=(-2.9, 2.9), facecolor="#cdcdcd")

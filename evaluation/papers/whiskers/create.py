@@ -208,10 +208,7 @@ def _summary(result: CreateResult) -> str:
     """The line below the table over all settings of recall."""
     found = [variant for name, variant in result.variants.items() if name.startswith("create ")]
     odometry = found[0].odometry
-    final, live, drawn, bound = (
-        np.array([getattr(variant, name) for variant in found])
-        for name in ("final", "live", "map", "revisits")
-    )
+    final, live, drawn, bound = np.array([[v.final, v.live, v.map, v.revisits] for v in found]).T
     doubted = sum(variant.doubt > DOUBTED for variant in found)
     above = [int((errors > odometry + 1e-6).sum()) for errors in (final, live)]
     return (

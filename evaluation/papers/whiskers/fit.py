@@ -155,9 +155,7 @@ def _draw(result: _Rigs, png: Path) -> None:
     fits, paths, _ = records[CREATE]
     for k, half in enumerate(("first half", "second half")):
         other = fits[2 - k].correction
-        label = (
-            f"{half}, corrected by the other" if other != UNCORRECTED else f"{half}: the other is not sure"
-        )
+        label = f"{half}{', corrected by the other' if other != UNCORRECTED else ': the other is not sure'}"
         _draw_paths(style.add_axes(figure, 0.62 + 2.45 * k, 3.35, 2.2, 2.2), paths[k], label)
     _draw_ate(style.add_axes(figure, 5.75, 3.45, 1.95, 2.05), records)
     _draw_whiskers(style.add_axes(figure, 0.75, 0.7, 6.9, 1.6), signals, whiskers)
@@ -178,21 +176,13 @@ def _draw_intervals(axes: style.Axes, records: dict[str, _Record], key: str, nam
     axes.set_xlabel(label, color=style.LABEL_GREY, fontsize=9)
     axes.grid(axis="x", color=style.LINE_GREY, lw=0.7)
     if named:
-        for colour, word, at in zip(
-            colours, ("whole", "first half", "second half"), (0, 0.8, 1.8), strict=True
-        ):
-            axes.annotate(
-                word, (0, 1), (72 * (at - 0.3), 6), "axes fraction", "offset points",
-                color=colour, fontsize=8.5,
-            )  # fmt: skip
+        words, offset = ("whole", "first half", "second half"), ("axes fraction", "offset points")
+        for colour, word, at in zip(colours, words, (0, 0.8, 1.8), strict=True):
+            axes.annotate(word, (0, 1), (72 * (at - 0.3), 6), *offset, color=colour, fontsize=8.5)
 
 
 def _draw_paths(axes: style.Axes, paths: tuple[np.ndarray, ...], label: str) -> None:
-    words = (
-        ("truth", style.GREY, 3.0),
-        ("as recorded", style.VERMILLION, 1.0),
-        ("corrected", style.BLUE, 1.0),
-    )
+    words = ("truth", style.GREY, 3.0), ("as recorded", style.VERMILLION, 1.0), ("corrected", style.BLUE, 1.0)
     truth, *found = paths
     aligned = truth, *(compose(fit_rigid_motion(path, truth), path) for path in found)
     for path, (word, colour, width) in zip(aligned, words, strict=True):
@@ -222,10 +212,9 @@ def _draw_ate(axes: style.Axes, records: dict[str, _Record]) -> None:
 def _draw_whiskers(axes: style.Axes, signals: SignalRecord, fit: SignalFit) -> None:
     at = np.arange(len(signals.names))
     for channel, shift in enumerate((-0.25, 0.0, 0.25)):
-        label = "noise" if channel == 0 else None
-        axes.bar(at + shift, fit.noise[:, channel], 0.22, color=style.BLUE, alpha=0.45, label=label)
-        white = "white part" if channel == 0 else None
-        axes.bar(at + shift, fit.white[:, channel], 0.22, color=style.BLUE, label=white)
+        labels = ("noise", "white part") if channel == 0 else (None, None)
+        axes.bar(at + shift, fit.noise[:, channel], 0.22, color=style.BLUE, alpha=0.45, label=labels[0])
+        axes.bar(at + shift, fit.white[:, channel], 0.22, color=style.BLUE, label=labels[1])
     for k in fit.dirty:
         axes.annotate(
             "dirty free record", (k + 0.4, 1.12 * fit.noise.max()), ha="right", fontsize=8.5,
