@@ -125,7 +125,10 @@ def _draw_drift(result: _Drift, png: Path) -> None:
 
 def _errors_of(seed: int, times: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[L, M, 2] errors of packets, of odometry, and of packets against odometry."""
-    study = _course(seed, times[-1])
+    exact, seconds = "odometry={speed_white: 0.0, heading_white: 0.0}", times[-1] + 1
+    rat = f"seconds={seconds}", f"rate_hz={RATE}", f"seed={seed}", "walk={}", exact, "views.every=1000"
+    config = rat_config(*(f"rat_simulation.{setting}" for setting in rat))
+    study = read_course(config, round(seconds * RATE), False, 2, (0,), seed)
     at = np.round(np.array(times) * RATE).astype(int)
     packets, odometry = _packets(study)[:, at], _odometry(study)[:, at]
     true = study.expected[at]
@@ -133,13 +136,6 @@ def _errors_of(seed: int, times: tuple[int, ...]) -> tuple[np.ndarray, np.ndarra
     pairs = (packets, true), (odometry, true), (packets, odometry)
     packet, alone, added = (panels.error_size((a - b) * unit) for a, b in pairs)
     return packet, alone, added
-
-
-def _course(seed: int, seconds: int) -> StudyCourse:
-    exact = "odometry={speed_white: 0.0, heading_white: 0.0}"
-    rat = f"seconds={seconds + 1}", f"rate_hz={RATE}", f"seed={seed}", "walk={}", exact, "views.every=1000"
-    config = rat_config(*(f"rat_simulation.{setting}" for setting in rat))
-    return read_course(config, round((seconds + 1) * RATE), False, 2, (0,), seed)
 
 
 def _packets(study: StudyCourse) -> np.ndarray:
