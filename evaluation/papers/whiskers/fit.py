@@ -155,8 +155,8 @@ def _draw(result: _Rigs, png: Path) -> None:
     fits, paths, _ = records[CREATE]
     for k, half in enumerate(("first half", "second half")):
         other = fits[2 - k].correction
-        label = f"{half}{', corrected by the other' if other != UNCORRECTED else ': the other is not sure'}"
-        _draw_paths(style.add_axes(figure, 0.62 + 2.45 * k, 3.35, 2.2, 2.2), paths[k], label)
+        how = ", corrected by the other" if other != UNCORRECTED else ": the other is not sure"
+        _draw_paths(style.add_axes(figure, 0.62 + 2.45 * k, 3.35, 2.2, 2.2), paths[k], half + how)
     _draw_ate(style.add_axes(figure, 5.75, 3.45, 1.95, 2.05), records)
     _draw_whiskers(style.add_axes(figure, 0.75, 0.7, 6.9, 1.6), signals, whiskers)
     figure.savefig(png)
