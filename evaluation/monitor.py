@@ -314,7 +314,8 @@ def draw_watch(seen: RunProgress, walls: np.ndarray = NO_WALLS) -> style.Figure:
     style.metre_grid(axes, style.TRUTH if np.isfinite(seen.truth).any() else style.MAP)
     _paint_counts(figure, seen, style.LEFT + style.INNER - _COUNTS + 0.25)
     if len(seen.path):
-        return style.add_legend(figure, axes)
+        style.add_legend(figure, axes)
+    return figure
 
 
 def _paint(axes: style.Axes, seen: RunProgress, walls: np.ndarray) -> None:

@@ -171,8 +171,9 @@ def draw_tuning(views: ViewDifferences, scores: np.ndarray, winner: float | None
     right.plot(threshold, correct, "o-", ms=3, lw=1.0, color=GREEN, label="correct")
     right.plot(threshold, incorrect, "x-", ms=4, lw=1.0, color=PURPLE, label="incorrect")
     style.name_axes(right, "threshold", "re-localisations")
-    for axes in (left, right) if winner is not None else ():
-        axes.axvline(winner, color=INK, lw=1.1, ls=_DOTS, label="chosen")
+    if winner is not None:
+        for axes in (left, right):
+            axes.axvline(winner, color=INK, lw=1.1, ls=_DOTS, label="chosen")
     right.legend(frameon=False, fontsize=9, labelcolor=INK)
     return style.add_legend(figure, left)
 

@@ -192,8 +192,8 @@ def _measure_run(task: tuple[RunConfig, str, int]) -> RunFigures:
     _, session, run = run_recording(config, _PERTURBATIONS[copies] if seed else None, seed)
     claims = closure_claims(session.map, run.truth)
     false, sequences, odds = judge_claims(claims)
-    errors = (known_ate(poses, run.truth) for poses in (run.odometry, run.trajectory, run.live))
-    return RunFigures(*errors, false[claims.accepted], sequences, odds)
+    odometry, final, live = (known_ate(path, run.truth) for path in (run.odometry, run.trajectory, run.live))
+    return RunFigures(odometry, final, live, false[claims.accepted], sequences, odds)
 
 
 def judge_claims(claims: ClosureClaims) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

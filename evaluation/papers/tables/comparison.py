@@ -313,7 +313,7 @@ def _compared_cells(what: Compared, pairs: _Pairs) -> dict[str, str]:
         "sessions": str(len(pairs.keys)),
         f"{what.label}, now / before [95 %]": _ratio(pairs, what.error),
         f"live {what.label.split()[-1]}, now / before [95 %]": _ratio(pairs, what.live),
-        f"{what.label} / odometry, median": _medians(*over, pairs),
+        f"{what.label} / odometry, median": _medians(over[0], over[1], pairs),
         "worse than odometry": _count(what.worse, pairs, what.error, what.odometry),
         "live worse than odometry": _count(what.worse, pairs, what.live, what.odometry),
         **medians,

@@ -73,9 +73,13 @@ class Variant(NamedTuple):
 def _measure_variant(slam_map: Map, run: SessionResult) -> Variant:
     """The figures of a session with this map."""
     claims, paths = closure_claims(slam_map, run.truth), (run.odometry, run.trajectory, run.live)
+    odometry, final, live = (known_ate(path, run.truth) for path in paths)
     false = (claims.distance > FALSE_DISTANCE) | (claims.turn > FALSE_TURN)
     return Variant(
-        *(known_ate(path, run.truth) for path in (*paths, slam_map.map_trajectory())),
+        odometry,
+        final,
+        live,
+        known_ate(slam_map.map_trajectory(), run.truth),
         doubt=slam_map.final_doubt(),
         accepted=int(claims.accepted.sum()),
         false=int((false & claims.accepted).sum()),
