@@ -238,12 +238,9 @@ class SessionBatch:
     def __init__(self, backend: RecallBackend, at_once: bool) -> None:
         self._backend = backend
         every: Any = jax.vmap if at_once else _one_by_one
-
-        def run(states: RecallState, records: PackedRecords, steps: Any) -> Any:
-            return every(lambda state, rows: run_chunk(backend.kernel, state, rows, steps))(states, records)
-
+        run = partial(run_chunk, backend.kernel)
         self._follow = jax.jit(every(backend.follow_map))
-        self._run = jax.jit(run, donate_argnums=0)
+        self._run = jax.jit(every(run, in_axes=(0, 0, None)), donate_argnums=0)
 
     def replay(self, recordings: Sequence[Recording]) -> RecallState:
         """The final states [B, ...] of B recorded sessions of as many steps, each as by itself.
@@ -289,6 +286,19 @@ def _stack(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
 
 
-def _one_by_one(function: Any) -> Any:
+def _one_by_one(function: Any, in_axes: tuple[int | None, ...] | None = None) -> Any:
     """`jax.vmap` by a loop."""
-    return lambda *values: lax.map(lambda rows: function(*rows), values)
+
+    def each(*values: Any) -> Any:
+        axes = in_axes or (0,) * len(values)
+        mapped = [k for k, axis in enumerate(axes) if axis == 0]
+
+        def call(rows: Any) -> Any:
+            given = list(values)
+            for k, row in zip(mapped, rows, strict=True):
+                given[k] = row
+            return function(*given)
+
+        return lax.map(call, tuple(values[k] for k in mapped))
+
+    return each
