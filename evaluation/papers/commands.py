@@ -56,14 +56,10 @@ def add_commands(commands: Commands) -> None:
         for name, title in figures.items():
             parser = names.add(name, _figure, f"{paper}: {title}", f"reproduce {name} --sets 1")
             _add_count(parser, "--sets", SETS.get(name, USUAL_SETS), "mazes or trials per condition")
-            parser.add_argument(
-                "--seed", type=int, default=0, metavar="S", help="seed of all sets (default 0)"
-            )
-            parser.add_argument(
-                "-o", "--output", type=Path, default=Path("runs") / "reproduce", metavar="DIR",
-                check=partial(require_own_folder, marks=[f"{figure}.csv" for figure in SALMAN2016 | FOX2012]),
-                help=f"folder for {name}.csv and {name}.png (default runs/reproduce)",
-            )  # fmt: skip
+            help = "seed of all sets (default 0)"
+            parser.add_argument("--seed", type=int, default=0, metavar="S", help=help)
+            marks = [f"{figure}.csv" for figure in SALMAN2016 | FOX2012]
+            _add_output(parser, f"folder for {name}.csv and {name}.png", marks, "reproduce")
             add_set(parser)
             _add_count(parser, "--workers", 0, "processes")
             parser.set_defaults(name=name)
@@ -73,9 +69,7 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     add_config(threshold)
     _add_count(threshold, "--workers", 1, "processes")
-    threshold.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="new folder for threshold.png and threshold.csv"
-    )
+    threshold.add_path("-o", "DIR", "new folder for threshold.png and threshold.csv")
     tables = names.add(
         "tables", None, "print a table of the results as Markdown", "reproduce tables laser --rows square"
     )
@@ -86,11 +80,7 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
     _add_row_names(real, REAL)
     real.set_defaults(page="real")
-    real.add_argument(
-        "-o", "--output", type=Path, default=Path("runs") / "real", metavar="DIR",
-        check=partial(require_own_folder, marks=["real.md"]),
-        help="folder for real.md and a picture per figure (default runs/real)",
-    )  # fmt: skip
+    _add_output(real, "folder for real.md and a picture per figure", ["real.md"], "real")
     title = "maps found again, continued, merged and changed"
     # Mazes 31000 to 31030, 32700 to 32707 and 33000 to 33059 were used to choose settings.
     maps = _add_rows(names, "maps", _maps, title, MAPS, 32000)
@@ -102,10 +92,7 @@ def add_commands(commands: Commands) -> None:
         "reproduce templates create_arena -o runs/templates.npz",
     )  # fmt: skip
     add_config(train)
-    train.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="NPZ",
-        check=partial(require_new_file, parents=True), help="the new file",
-    )  # fmt: skip
+    train.add_path("-o", "NPZ", "the new file", required=True, check=partial(require_new_file, parents=True))
 
 
 def _add_rows(
@@ -121,18 +108,19 @@ def _add_rows(
     parser = names.add(name, command, title, example)
     _add_row_names(parser, rows)
     parser.set_defaults(page=name)
-    parser.add_argument(
-        "--sessions", type=positive_integer, metavar="N",
-        help="sessions or repeats per row (default: of the row)",
-    )  # fmt: skip
+    help = "sessions or repeats per row (default: of the row)"
+    parser.add_argument("--sessions", type=positive_integer, metavar="N", help=help)
     _add_count(parser, "--first", first, "seed of the first session; each has the next one")
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("runs") / name, metavar="DIR",
-        check=partial(require_own_folder, marks=[f"{name}.md", name]),
-        help=f"folder for {name}.md, a picture per row, and what is used again (default runs/{name})",
-    )  # fmt: skip
+    kept = f"folder for {name}.md, a picture per row, and what is used again"
+    _add_output(parser, kept, [f"{name}.md", name], name)
     _add_count(parser, "--workers", 1, "processes")
     return parser
+
+
+def _add_output(parser: CommandParser, help: str, marks: Sequence[str], default: str | None = None) -> None:
+    """Registers `-o` for a folder that is known by one of the marks; by default in `runs`."""
+    folder, note = (Path("runs") / default, f" (default runs/{default})") if default else (None, "")
+    parser.add_path("-o", "DIR", help + note, default=folder, check=partial(require_own_folder, marks=marks))
 
 
 def _add_row_names(parser: argparse.ArgumentParser, rows: Iterable[str]) -> None:
@@ -215,11 +203,10 @@ def _maps(arguments: argparse.Namespace) -> None:
 
     names = select_rows(arguments.rows, MAPS)
     first, sessions, workers = arguments.first, arguments.sessions, arguments.workers
-    for line in reproduce_maps(
-        names, Methods(), arguments.output, first, sessions, workers, arguments.against
-    ):
+    output, against = arguments.output, arguments.against
+    for line in reproduce_maps(names, Methods(), output, first, sessions, workers, against):
         print(line, flush=True)
-    print(f"wrote {arguments.output / 'maps.md'} and {arguments.output / 'maps.csv'}")
+    print(f"wrote {output / 'maps.md'} and {output / 'maps.csv'}")
 
 
 BACKENDS = ("recall", "classic")
@@ -239,19 +226,15 @@ def _add_count(parser: argparse.ArgumentParser, name: str, default: int, help: s
 def _add_tables(tables: Commands) -> None:
     """Registers the tables."""
 
-    def add(name: str, help: str, example: str) -> argparse.ArgumentParser:
+    def add(name: str, help: str, example: str) -> CommandParser:
         parser = tables.add(name, _print_table, help, f"reproduce tables {name} {example}")
         parser.set_defaults(table=name, file="")
         return parser
 
     touch = add("touch", "whisker sessions under many conditions", "--rows main --sessions 1")
     _add_count(touch, "--first", 31100, "number of the first maze; each session has the next one")
-    touch.add_argument(
-        "--sessions",
-        type=positive_integer,
-        metavar="N",
-        help="sessions per row (default: of the row, 12 to 40)",
-    )
+    help = "sessions per row (default: of the row, 12 to 40)"
+    touch.add_argument("--sessions", type=positive_integer, metavar="N", help=help)
     touch.add_argument("--backend", choices=BACKENDS, default="recall", help="the method (default recall)")
     _add_session_file(touch, "touch.csv")
     grid = add("grid", "the grid filter in arenas", "--rows bias --worlds A --arenas 1")
@@ -269,9 +252,7 @@ def _add_tables(tables: Commands) -> None:
     closures = add("closures", "fits and tests the log-odds of closure sequences", "--sessions 2")
     _add_count(closures, "--sessions", 6, "sessions per row")
     _add_count(closures, "--workers", 0, "processes")
-    closures.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="folder for closure_judge.json, the weights"
-    )
+    closures.add_path("-o", "DIR", "folder for closure_judge.json, the weights")
     closures.set_defaults(file="closure_judge.json")
     for parser in (touch, grid, laser, buildings):
         parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows")
@@ -292,23 +273,19 @@ def _add_tables(tables: Commands) -> None:
     _add_count(batches, "--rounds", 3, "repeats, of which the median is taken")
 
 
-def _add_session_file(parser: argparse.ArgumentParser, file: str) -> None:
+def _add_session_file(parser: CommandParser, file: str) -> None:
     """Registers `-o` and `--against` of a table whose sessions are written to a file."""
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR",
-        check=partial(require_own_folder, marks=SESSION_FILES),
-        help=f"folder for {file}, the figures of each session as soon as it is done",
-    )  # fmt: skip
+    _add_output(
+        parser, f"folder for {file}, the figures of each session as soon as it is done", SESSION_FILES
+    )
     _add_against(parser, file)
     parser.set_defaults(file=file)
 
 
-def _add_against(parser: argparse.ArgumentParser, file: str) -> None:
+def _add_against(parser: CommandParser, file: str) -> None:
     """Registers `--against`."""
-    parser.add_argument(
-        "--against", type=Path, metavar="DIR",
-        help=f"compare with the same sessions in {file} of an earlier run, given -o DIR",
-    )  # fmt: skip
+    help = f"compare with the same sessions in {file} of an earlier run, given -o DIR"
+    parser.add_path("--against", "DIR", help)
 
 
 def _print_table(arguments: argparse.Namespace) -> None:
@@ -328,8 +305,7 @@ def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
         from evaluation.papers.tables import touch_table as touch
 
         rows = select_rows(arguments.rows, touch.ROWS, touch.DEFAULT_ROWS)
-        files = arguments.output, arguments.against
-        first, sessions = arguments.first, arguments.sessions
+        first, sessions, files = arguments.first, arguments.sessions, (arguments.output, arguments.against)
         return touch.touch_table(rows, first, sessions, arguments.workers, arguments.backend, files)
     if name == "grid":
         from evaluation.papers.tables import grid_table as grid
@@ -344,8 +320,7 @@ def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
 
         copies, workers = arguments.copies, arguments.workers
         if name == "laser":
-            rows = select_rows(arguments.rows, buildings.ROWS)
-            return buildings.laser_table(rows, copies, workers)
+            return buildings.laser_table(select_rows(arguments.rows, buildings.ROWS), copies, workers)
         files = arguments.output, arguments.against
         return buildings.buildings_table(buildings.choose_rows(arguments.rows), copies, workers, files=files)
     if name == "health":

@@ -25,7 +25,7 @@ from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.trajectory import ate
 from evaluation.studies.metrics import SessionResult
 from evaluation.studies.perturbation import Perturbation
-from ratslam.core.backend import Backend
+from ratslam.core.backend import Backend, Map
 from ratslam.core.compilation import Precision, prepare_precision
 from ratslam.core.session import Session, capacity_at
 from ratslam.grid.config import GridConfig
@@ -64,37 +64,40 @@ def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
     return config, log
 
 
-def run_session(
-    config: RunConfig,
-    log: InMemorySource,
-    start: Callable[[RunConfig, InMemorySource], Session] | None = None,
-) -> SessionResult:
+def collect_recording(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
+    """The same of a recording, of which some steps may lack the true pose.
+
+    Raises:
+        InputError: the recording cannot be used, or has no truth.
+    """
+    with open_observations(config) as (config, source):
+        log = load_into_memory(source)
+    if log.truth is None:
+        raise InputError(log.name, "no true poses", "a recording with truth")
+    return config, log
+
+
+def run_session(config: RunConfig, log: InMemorySource, session: Session | None = None) -> SessionResult:
     """Runs a session from memory, with a configuration completed by its source.
 
     Args:
-        start: makes the session; None: `start_session`.
+        session: at its start; None: that of `start_session`.
     """
-    session = (start or start_session)(config, log)
-    steps = list(session.replay(observation_of(sample) for sample in log))
-    place = np.array([int(step.estimate.place) for step in steps])
-    nodes = session.map.graph().nodes
+    session = session or start_session(config, log)
+    steps, map = list(session.replay(observation_of(sample) for sample in log)), session.map
+    place, live = np.array([int(step.estimate.place) for step in steps]), [step.pose for step in steps]
+    nodes = map.graph().nodes
     rows = (nodes[k] for k in range(len(nodes)))
     node = np.array([[row["x"], row["y"], row["heading"]] for row in rows]).reshape(-1, 3)
-    return SessionResult(
-        truth=np.asarray(log.truth),
-        odometry=integrate(log.motion[:, :3]),
-        trajectory=session.map.trajectory(),
-        place=np.where(place < len(node), place, -1),
-        node=node,
-        closures=session.map.closures(),
-        live=np.array([step.pose for step in steps]),
-        piece=session.map.pieces(),
-    )
+    truth, odometry = np.asarray(log.truth), integrate(log.motion[:, :3])
+    trajectory, place = map.trajectory(), np.where(place < len(node), place, -1)
+    closures, piece = map.closures(), map.pieces()
+    return SessionResult(truth, odometry, trajectory, place, node, closures, np.array(live), piece)
 
 
 def start_session(config: RunConfig, log: InMemorySource) -> Session:
     """A session at its start, for a configuration completed by its source; the next call takes it back."""
-    session = _compiled(*_kind(config, log))
+    session = _compiled(_kind(config, log))
     session.restart(config.session.seed)
     return session
 
@@ -107,7 +110,7 @@ def new_session(
     Args:
         change: is done to the backend before.
     """
-    session = _build(*_kind(config, log), change)
+    session = _build(_kind(config, log), change)
     session.restart(config.session.seed)
     return session
 
@@ -117,22 +120,18 @@ def capacity_for(steps: int) -> int:
     return capacity_at(max(steps, 1) - 1)
 
 
-def _kind(
-    config: RunConfig, log: InMemorySource
-) -> tuple[str, Settings, Precision, tuple[int, int, int], int]:
+_Kind = tuple[str, Settings, Precision, tuple[int, int, int], int]
+"""What sessions of one kernel share: name and settings of the method, precision, shape of views, rows."""
+
+
+def _kind(config: RunConfig, log: InMemorySource) -> _Kind:
     method = backend_settings(config.backend, config)
     reserve = max(capacity_for(log.length), config.session.reserve)
     return config.backend, method, config.session.precision, log.view_shape, reserve
 
 
-def _build(
-    name: str,
-    method: Settings,
-    precision: Precision,
-    shape: tuple[int, int, int],
-    reserve: int,
-    change: Callable[[Backend], None] | None = None,
-) -> Session:
+def _build(kind: _Kind, change: Callable[[Backend], None] | None = None) -> Session:
+    name, method, precision, shape, reserve = kind
     prepare_precision(precision)
     backend = build(name, method, Sensors(shape), precision)
     if change is not None:
@@ -142,27 +141,6 @@ def _build(
 
 _compiled = lru_cache(maxsize=2)(_build)
 """A session of any state; a recently compiled one is used again."""
-
-
-class RecordingRun(NamedTuple):
-    """A finished session of T steps over a recording.
-
-    Attributes:
-        config: completed for the recording. truth: [T, 3] true poses, rows of NaN where unknown. odometry,
-            online, final: [T, 3] poses by dead reckoning, as estimated at the time, and of the final map.
-    """
-
-    config: RunConfig
-    session: Session
-    truth: np.ndarray
-    odometry: np.ndarray
-    online: np.ndarray
-    final: np.ndarray
-
-    def ate(self, poses: np.ndarray) -> float:
-        """ATE of poses [T, 3] at the steps with truth, m."""
-        known = np.isfinite(self.truth).all(axis=1)
-        return ate(poses[known], self.truth[known])
 
 
 class ClosureClaims(NamedTuple):
@@ -185,34 +163,36 @@ class ClosureClaims(NamedTuple):
     log_odds: np.ndarray
 
 
-def run_recording(config: RunConfig, perturbation: Perturbation | None = None, seed: int = 0) -> RecordingRun:
+def known_ate(poses: np.ndarray, truth: np.ndarray) -> float:
+    """ATE of poses [T, 3] at the steps whose true pose [T, 3] is known, m."""
+    known = np.isfinite(truth).all(axis=1)
+    return ate(poses[known], truth[known])
+
+
+def run_recording(
+    config: RunConfig, perturbation: Perturbation | None = None, seed: int = 0
+) -> tuple[RunConfig, Session, SessionResult]:
     """Maps a recording, or the perturbed copy of a seed.
+
+    Returns:
+        the configuration completed for the recording, the finished session, and its outcome, with rows of NaN
+        where the truth is unknown.
 
     Raises:
         InputError: the recording cannot be used, or has no truth.
     """
-    with open_observations(config) as (config, source):
-        log = load_into_memory(source)
-    if log.truth is None:
-        raise InputError(log.name, "no true poses", "a recording with truth")
+    config, log = collect_recording(config)
     if perturbation is not None:
         log = perturbation(log, seed)
     session = build_session(config, log)
-    steps = list(session.replay(observation_of(sample) for sample in log))
-    return RecordingRun(
-        config=config,
-        session=session,
-        truth=np.asarray(log.truth),
-        odometry=integrate(log.motion[:, :3]),
-        online=np.array([step.pose for step in steps]),
-        final=session.map.trajectory(),
-    )
+    return config, session, run_session(config, log, session)
 
 
-def closure_claims(run: RecordingRun) -> ClosureClaims:
-    """The claims of all candidates in closures.csv that belong to a sequence."""
+def closure_claims(map: Map, truth: np.ndarray) -> ClosureClaims:
+    """The claims of all candidates in closures.csv of a map that belong to a sequence, beside true poses
+    [T, 3]."""
     rows = list[dict[str, str]]()
-    if (write := run.session.map.files().get("closures.csv")) is not None:
+    if (write := map.files().get("closures.csv")) is not None:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "closures.csv"
             write(path)
@@ -222,15 +202,13 @@ def closure_claims(run: RecordingRun) -> ClosureClaims:
         np.array([int(row[name]) for row in rows], int)
         for name in ("step", "match_step", "shift", "sequence")
     )
-    later, earlier = run.truth[step], run.truth[match]
-    angle = run.session.map.feedback().angle if rows else 0.0
-    return ClosureClaims(
-        sequence=sequence,
-        accepted=np.array([row["verdict"] == "accepted" for row in rows], bool),
-        distance=np.hypot(*(later - earlier)[:, :2].T),
-        turn=np.abs(wrap(later[:, 2] - earlier[:, 2] + shift * angle)),
-        log_odds=np.array([float(row["log_odds"]) for row in rows], float),
-    )
+    later, earlier = truth[step], truth[match]
+    angle = map.feedback().angle if rows else 0.0
+    accepted = np.array([row["verdict"] == "accepted" for row in rows], bool)
+    distance = np.hypot(*(later - earlier)[:, :2].T)
+    turn = np.abs(wrap(later[:, 2] - earlier[:, 2] + shift * angle))
+    odds = np.array([float(row["log_odds"]) for row in rows], float)
+    return ClosureClaims(sequence, accepted, distance, turn, odds)
 
 
 class ArenaSession(NamedTuple):

@@ -51,8 +51,7 @@ def draw_experience_history(run: RunArrays, card: Scorecard) -> style.Figure:
     axes.locator_params(integer=True)
     axes.grid(color=LINE_GREY, lw=0.7)
     style.name_axes(axes, "step", "experience, in order of creation")
-    style.add_legend(figure, axes, columns=2)
-    return figure
+    return style.add_legend(figure, axes, columns=2)
 
 
 def _judge(run: RunArrays, card: Scorecard, rows: np.ndarray) -> tuple[ExperienceMetric | None, str]:

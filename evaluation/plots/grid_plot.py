@@ -46,8 +46,7 @@ def draw_grid(panel: GridPanel) -> style.Figure:
     figure, axes = style.new_chart(tall, _BOTTOM, panel.name, panel.line, right=_KEY)
     _paint(axes, panel, errors=True)
     _paint_key(figure, style.LEFT + inner, _BOTTOM, min(tall, 2.4))
-    style.add_legend(figure, axes, columns=3)
-    return figure
+    return style.add_legend(figure, axes, columns=3)
 
 
 def draw_grids(title: str, line: str, panels: Sequence[GridPanel], *, across: int = 3) -> style.Figure:
@@ -77,8 +76,7 @@ def draw_grids(title: str, line: str, panels: Sequence[GridPanel], *, across: in
         figure.text(left / WIDTH, (top + 0.08) / whole, panel.line, fontsize=8, color=LABEL_GREY)
     _paint_key(figure, style.LEFT + inner, whole - style.TOP - _HEAD - high, min(high, 2.4))
     fullest = max(figure.axes, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
-    style.add_legend(figure, fullest, columns=5)
-    return figure
+    return style.add_legend(figure, fullest, columns=5)
 
 
 def grid_headline(score: GridScore) -> str:

@@ -99,8 +99,7 @@ def draw_map(
         _paint(axes, run, layers)
     start = layers.final if truth is None else truth[np.isfinite(truth).all(axis=1)]
     axes.plot(*start[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
-    style.add_legend(figure, axes)
-    return figure
+    return style.add_legend(figure, axes)
 
 
 def map_headline(card: Scorecard, found: str = "") -> str:
@@ -288,8 +287,7 @@ def draw_changes(
     name = "path where found" if run.found.any() else "_"
     axes.plot(*path.T, color=BLUE, lw=0.8, alpha=0.6, zorder=3, label=name)
     _mark(axes, changes, places, np.ptp(box, axis=0).max())
-    style.add_legend(figure, axes)
-    return figure
+    return style.add_legend(figure, axes)
 
 
 def _mark(axes: style.Axes, changes: Sequence[ChangeRow], places: np.ndarray, size: float) -> None:
@@ -340,8 +338,7 @@ def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequen
         )
         label = "start" if number == 0 else "_"
         axes.plot(*shown[end - count], "o", ms=8, mfc="none", mec=GREEN, mew=1.6, zorder=4, label=label)
-    style.add_legend(figure, axes)
-    return figure
+    return style.add_legend(figure, axes)
 
 
 def draw_way(
@@ -367,5 +364,4 @@ def draw_way(
     axes.plot(*way[:, :2].T, color=VERMILLION, lw=3.2, solid_capstyle="round", zorder=4, label="way")
     axes.plot(*way[0, :2], "o", ms=9, mfc="white", mec=GREEN, mew=2.2, ls="none", zorder=5, label="start")
     axes.plot(*way[-1, :2], "*", ms=15, color=INK, mec="white", mew=0.8, ls="none", zorder=5, label="goal")
-    style.add_legend(figure, axes, columns=6)
-    return figure
+    return style.add_legend(figure, axes, columns=6)

@@ -128,8 +128,8 @@ def metre_grid(axes: Axes, of: str = "") -> None:
     name_axes(axes, f"x{frame} (m)", f"y{frame} (m)")
 
 
-def add_legend(figure: Figure, axes: Axes, *, columns: int = 4) -> None:
-    """Adds a legend at the bottom left of the figure, in the order of drawing."""
+def add_legend(figure: Figure, axes: Axes, *, columns: int = 4) -> Figure:
+    """The figure with a legend at its bottom left, in the order of drawing."""
     handles, labels = axes.get_legend_handles_labels()
     across, up = figure.get_size_inches()
     figure.legend(
@@ -137,3 +137,4 @@ def add_legend(figure: Figure, axes: Axes, *, columns: int = 4) -> None:
         bbox_transform=figure.transFigure, borderaxespad=0, borderpad=0, frameon=False, fontsize=9,
         labelcolor=INK, handlelength=1.8, columnspacing=1.8,
     )  # fmt: skip
+    return figure

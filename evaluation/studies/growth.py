@@ -378,8 +378,7 @@ def _draw(name: str, rows: Sequence[_GrowthRow]) -> Figure | None:
                 label=f"{ground}, {statistic}",
             )  # fmt: skip
     style.name_axes(axes, "length of the session (steps)", "processor time of a step (ms), own thread")
-    style.add_legend(figure, axes, columns=len(grounds))
-    return figure
+    return style.add_legend(figure, axes, columns=len(grounds))
 
 
 def save_growth(name: str, rows: Sequence[_GrowthRow], folder: Path) -> list[Path]:

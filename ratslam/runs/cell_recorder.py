@@ -93,6 +93,21 @@ BUFFERED = 32 * CHUNK
 """Rows kept in memory before they are appended to the file."""
 
 
+def step_columns(
+    cells: PoseCellProbe, samples: Sequence[Sample], steps: Sequence[Step]
+) -> dict[str, np.ndarray]:
+    """The columns of `CellRecording` over steps and the samples of the source that they belong to."""
+    unknown = np.full(3, np.nan)
+    return {
+        "time": np.array([sample.time for sample in samples]),
+        "truth": np.array([unknown if sample.truth is None else sample.truth for sample in samples]),
+        "packet": np.array([cells.packet(step.evidence) for step in steps]),
+        "energy": np.array([cells.energy(step.evidence) for step in steps]),
+        "place": np.array([step.estimate.place for step in steps], np.int32),
+        "activity": np.array([step.probed for step in steps], np.float32),
+    }
+
+
 class CellRecorder:
     """Records the steps of a session whose probe is that of the plan.
 
@@ -122,21 +137,14 @@ class CellRecorder:
         if self._filled + len(steps) > BUFFERED:
             self._write()
         rows = self._rows[self._filled : self._filled + len(steps)]
-        unknown = np.full(3, np.nan)
-        rows["time"] = [sample.time for sample in samples]
-        rows["truth"] = [unknown if sample.truth is None else sample.truth for sample in samples]
-        rows["packet"] = [self._plan.cells.packet(step.evidence) for step in steps]
-        rows["energy"] = [self._plan.cells.energy(step.evidence) for step in steps]
-        rows["place"] = [step.estimate.place for step in steps]
-        rows["activity"] = [step.probed for step in steps]
+        for name, values in step_columns(self._plan.cells, samples, steps).items():
+            rows[name] = values
         self._filled += len(steps)
         if self._plan.bins is None:
             return
         if self._sums is None:
             self._sums = CellSums(self._plan.bins, int(np.prod(self._plan.cells.shape)), samples[0].time)
-        for sample, step in zip(samples, steps, strict=True):
-            if step.seldom is not None:
-                self._sums.add(sample.time, sample.truth, *self._plan.cells.active(step.seldom))
+        self._sums.add_steps(self._plan.cells, samples, steps)
 
     def finish(self) -> None:
         """Writes cells.npz with all rows and the sums, and removes cells.rows.
@@ -195,6 +203,12 @@ class CellSums:
         np.add.at(self._heading[heading], cell, share)
         self._place_seconds[place] += elapsed
         self._heading_seconds[heading] += elapsed
+
+    def add_steps(self, cells: PoseCellProbe, samples: Sequence[Sample], steps: Sequence[Step]) -> None:
+        """Adds the steps whose activity of all cells was held."""
+        for sample, step in zip(samples, steps, strict=True):
+            if step.seldom is not None:
+                self.add(sample.time, sample.truth, *cells.active(step.seldom))
 
     def result(self) -> BinnedSums:
         """The sums so far, float32."""

@@ -17,6 +17,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from evaluation.cells import rate_map
 from evaluation.cells.fields import Fields, find_fields, score_borders
 from evaluation.cells.grid_score import autocorrelogram, lattice_scores
 from evaluation.cells.head_direction import mean_vector_length, peak_rate
@@ -27,18 +28,10 @@ from evaluation.cells.information import (
     selectivity,
     sparsity,
 )
-from evaluation.cells.rate_map import (
-    arena_edges,
-    bin_activity,
-    correlate,
-    neighbour_means,
-    rate_maps,
-    tuning_curves,
-)
 from evaluation.cells.recording import BinnedSums
-from evaluation.papers.cells.panels import table_lines
 from evaluation.papers.cells.rat_sessions import SECONDS, record_rat
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from tactile.base.errors import InputError
 
 CELLS, GOAL = 100, 1e-6
@@ -64,8 +57,8 @@ def compare_scores(task: Task, seconds: float = SECONDS) -> list[tuple[str, str,
     count = task.sessions or CELLS
     recording = record_rat("rat", count, seconds=seconds, seed=task.first)
     rates = recording.activity * float(np.prod(recording.shape))
-    edges = arena_edges(recording.truth, 20)
-    sums = bin_activity(recording.time, recording.truth, rates, *edges, 36)
+    edges = rate_map.arena_edges(recording.truth, 20)
+    sums = rate_map.bin_activity(recording.time, recording.truth, rates, *edges, 36)
     with quiet():
         pairs = [*_beside_opexebo(opexebo, sums), *_beside_pynapple(pynapple, sums)]
     found = []
@@ -90,7 +83,7 @@ def _agreement_table(result: list[tuple[str, str, int, float, float]]) -> list[s
 
 
 def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[_Pair]:
-    analysis, maps, curves = opexebo.analysis, rate_maps(sums, 1.5), tuning_curves(sums)
+    analysis, maps, curves = opexebo.analysis, rate_map.rate_maps(sums, 1.5), rate_map.tuning_curves(sums)
     masked = [np.ma.masked_invalid(each) for each in maps]
     seconds = np.ma.masked_where(np.isnan(maps[0]), sums.seconds)
     stats = [analysis.rate_map_stats(each, seconds) for each in masked]
@@ -102,10 +95,10 @@ def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[_Pair]:
     }
     for name, (score, key) in named.items():
         yield name, "opexebo", score(maps, sums.seconds), _numbers(each[key] for each in stats)
-    plain = np.nan_to_num(rate_maps(sums, 0.0))
-    framed = neighbour_means(np.pad(plain, ((0, 0), (1, 1), (1, 1))))[:, 1:-1, 1:-1]
+    plain = np.nan_to_num(rate_map.rate_maps(sums, 0.0))
+    framed = rate_map.neighbour_means(np.pad(plain, ((0, 0), (1, 1), (1, 1))))[:, 1:-1, 1:-1]
     theirs = _numbers(analysis.rate_map_coherence(np.ma.masked_invalid(each)) for each in plain)
-    yield "coherence, not transformed", "opexebo", correlate(plain, framed), theirs
+    yield "coherence, not transformed", "opexebo", rate_map.correlate(plain, framed), theirs
     tuned = [analysis.tuning_curve_stats(np.ma.masked_invalid(each)) for each in curves]
     vector = mean_vector_length(curves, sums.heading_seconds)
     yield "mean vector length", "opexebo", vector, _numbers(each["hd_mvl"] for each in tuned)
@@ -120,8 +113,8 @@ def _beside_opexebo(opexebo: ModuleType, sums: BinnedSums) -> Iterator[_Pair]:
 
 def _beside_pynapple(pynapple: ModuleType, sums: BinnedSums) -> Iterator[_Pair]:
     for what, rates, seconds in (
-        ("place", rate_maps(sums, 1.5), sums.seconds),
-        ("heading", tuning_curves(sums), sums.heading_seconds),
+        ("place", rate_map.rate_maps(sums, 1.5), sums.seconds),
+        ("heading", rate_map.tuning_curves(sums), sums.heading_seconds),
     ):
         theirs = mutual_information(pynapple, rates, seconds)
         mine = information(rates, seconds), information_rate(rates, seconds)

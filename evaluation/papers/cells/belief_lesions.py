@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from evaluation.papers.cells.panels import name_panel, panel_grid, table_lines, time_call
+from evaluation.papers.cells.panels import name_panel, panel_grid, time_call
 from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.buildings import FALSE_DISTANCE
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import Recording
 from evaluation.papers.tables.touch_table import SessionFigures, TouchTask, run_and_measure, task_config
 from evaluation.papers.trial_sessions import closure_claims, collect_session, new_session, run_recording
@@ -205,7 +206,8 @@ def _run_lesion(task: tuple[str, str, int]) -> tuple[SessionFigures | None, set[
         functions = LESIONS[lesion](maze)
     with replaced(functions):
         if not row:
-            claims = closure_claims(run_recording(INTEL.configuration()))
+            _, session, run = run_recording(INTEL.configuration())
+            claims = closure_claims(session.map, run.truth)
             true = int((claims.accepted & (claims.distance <= FALSE_DISTANCE)).sum())
             return None, {(step,) for step in np.flatnonzero(claims.accepted).tolist()}, true
         result, figures = run_and_measure(TouchTask(row, maze), new_session)
@@ -299,8 +301,7 @@ def _draw_lesions(result: _Lesions, png: Path) -> None:
         inside = axes[0][0].get_yaxis_transform()
         axes[0][0].text(0.02, y, lesion, transform=inside, va="center", fontsize=7, color=style.INK)
     axes[0][1].set_xscale("log")
-    style.add_legend(figure, axes[0][0])
-    figure.savefig(png)
+    style.add_legend(figure, axes[0][0]).savefig(png)
 
 
 CELL, SIDE = 0.05, 21
@@ -348,11 +349,8 @@ def _run_size(row: str, task: tuple[_Network, int]) -> _Sized:
         assert backend.cell == CELL
         cells = PoseCellConfig(cells_xy=side, cell_size=size)
         backend.network = backend.network._replace(cells=cells, excite=backend.network.excite * unit)
-        lengths = {
-            "local_sd": backend.recall.local_sd * unit,
-            "local_heading_rate": backend.recall.local_heading_rate / unit,
-        }
-        backend.recall = backend.recall.model_copy(update=lengths)
+        sd, rate = backend.recall.local_sd * unit, backend.recall.local_heading_rate / unit
+        backend.recall = backend.recall.model_copy(update={"local_sd": sd, "local_heading_rate": rate})
 
     def start(config: RunConfig, log: InMemorySource) -> Session:
         sessions.append(new_session(config, log, change))
@@ -423,8 +421,7 @@ def _draw_sizes(result: _Sizes, png: Path) -> None:
         panel.set_ylim(bottom=0)
         style.name_axes(panel, across, "revisits closed")
     axes[0][1].set_xscale("log")
-    style.add_legend(figure, axes[0][0])
-    figure.savefig(png)
+    style.add_legend(figure, axes[0][0]).savefig(png)
 
 
 LESIONS_FIGURE = Figure("Lesions of the belief network", measure_lesions, _table_lesions, _draw_lesions)

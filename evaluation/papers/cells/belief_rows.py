@@ -18,8 +18,9 @@ import numpy as np
 
 from evaluation.papers.cells import belief_world as worlds
 from evaluation.papers.cells.belief_world import AROUND, CELLS, LOOKS, PARTICLES, World, exact, network, pace
-from evaluation.papers.cells.panels import name_panel, panel_grid, table_lines
+from evaluation.papers.cells.panels import name_panel, panel_grid
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.plots import style
 from evaluation.studies.executor import run_tasks
 from ratslam.mapping.config import KeyframeMapConfig
@@ -28,12 +29,8 @@ from ratslam.recall.filter import BASIN
 from tactile.base.random_streams import stream
 from tactile.base.se2 import compose, wrap
 
-NETWORK, FINER, EXACT, MANY = (
-    "network",
-    "network, cells of half the side",
-    "exact",
-    f"{PARTICLES:,} particles",
-)
+NETWORK, FINER = "network", "network, cells of half the side"
+EXACT, MANY = "exact", f"{PARTICLES:,} particles"
 CONTROL = "additive injection (control)"
 COLOURS = {
     EXACT: style.INK, MANY: style.GREEN, NETWORK: style.BLUE, FINER: style.SKY, CONTROL: style.VERMILLION,
@@ -181,8 +178,7 @@ def _draw_posterior(result: tuple[_Scores, str], png: Path) -> None:
     axes[0][1].plot([40, 100], [40, 100], "--", color=style.GREY, lw=0.9)
     across, up = "probability of the region (%)", "updates with the truth in it (%)"
     name_panel(axes[0][1], "truth in the region", across, up)
-    style.add_legend(figure, axes[0][1], columns=3)
-    figure.savefig(png)
+    style.add_legend(figure, axes[0][1], columns=3).savefig(png)
 
 
 DIFFERENCE = 24
@@ -232,12 +228,8 @@ def measure_rooms(task: Task, sessions: int = 3) -> _Rooms:
     found = {name: np.array(each) for name, each in rows.items()}
     evident = np.cumsum(np.abs(found[EXACT][:, 0] - 0.5) > SIGN, axis=1) > 0
     seeds = range(task.first, task.first + sessions)
-    closures = [
-        list(
-            run_tasks(partial(worlds.room_closures, difference=DIFFERENCE, alike=alike), seeds, task.workers)
-        )
-        for alike in (True, False)
-    ]
+    kinds = (partial(worlds.room_closures, difference=DIFFERENCE, alike=alike) for alike in (True, False))
+    closures = [list(run_tasks(kind, seeds, task.workers)) for kind in kinds]
     return found, evident, closures
 
 
@@ -272,16 +264,9 @@ def _table_rooms(result: _Rooms) -> list[str]:
         before, after = np.abs(share[early] - 0.5), share[:, -1]
         decided = (np.abs(share - 0.5) > DECIDED - 0.5) & early
         apart = np.abs(share - found[EXACT][:, 0]).max()
+        first = f"{before.max():.3f}", f"{packet[early].max():.3f}", decided.any(axis=1).sum()
         ends = np.median(after), after.min(), np.median(room[:, -1]), apart
-        rows.append(
-            [
-                name,
-                f"{before.max():.3f}",
-                f"{packet[early].max():.3f}",
-                decided.any(axis=1).sum(),
-                *(f"{each:.3f}" for each in ends),
-            ]
-        )
+        rows.append([name, *first, *(f"{each:.3f}" for each in ends)])
     alike, unlike = (np.array(each, int).reshape(-1, 3).sum(axis=0).tolist() for each in closures)
     below = [
         f"{len(closures[0])} sessions of the whole product with given place ids. Until the first"
@@ -388,8 +373,7 @@ def _draw_kidnaps(result: _Kidnaps, png: Path) -> None:
     left.axvline(0, color=style.GREY, ls="--", lw=0.9)
     name_panel(left, "novelty, median", "updates since the kidnap", "novelty")
     name_panel(right, "found again", "updates since the kidnap", "share of kidnaps")
-    style.add_legend(figure, right, columns=2)
-    figure.savefig(png)
+    style.add_legend(figure, right, columns=2).savefig(png)
 
 
 HEADINGS, WIDTH = 72, 20.0
@@ -476,8 +460,7 @@ def _draw_conflicts(result: _Weights, png: Path) -> None:
             panel.plot(ANGLES, weights, mark, color=COLOURS[name], lw=1.6, ms=5, label=name)
         panel.set_ylim(-0.02, 1.02)
         name_panel(panel, case, "degrees apart", "weight")
-    style.add_legend(figure, axes[0][0])
-    figure.savefig(png)
+    style.add_legend(figure, axes[0][0]).savefig(png)
 
 
 POSTERIOR_FIGURE = Figure(

@@ -138,11 +138,11 @@ def exact(world: World, cell: float = 0.0) -> np.ndarray:
     return np.array(rows)
 
 
-def particles(world: World, seed: int, count: int = PARTICLES) -> np.ndarray:
-    """[T, N + 1] the same by particles, which are drawn anew after each update, one in each of `count` equal
-    shares of the mixture of their weighed predictions."""
+def particles(world: World, seed: int) -> np.ndarray:
+    """[T, N + 1] the same by particles, which are drawn anew after each update, one in each of `PARTICLES`
+    equal shares of the mixture of their weighed predictions."""
     random, state = stream(seed, "cells.belief_particles"), np.append(world.start, 1 - world.start.sum())
-    rows = []
+    rows, count = [], PARTICLES
     for k in range(len(world.motion)):
         drawn = np.searchsorted(np.cumsum(state), (np.arange(count) + random.random()) / count)
         held = np.bincount(np.minimum(drawn, len(state) - 1), minlength=len(state)) / count
@@ -288,13 +288,9 @@ def transition(poses: np.ndarray, motion: np.ndarray, cell: float) -> np.ndarray
     """
     turned = poses[:, 2] - motion[2]
     cosine, sine = np.cos(turned), np.sin(turned)
-    before = np.column_stack(  # where the robot was if it is now at each view cell
-        [
-            poses[:, 0] - cosine * motion[0] + sine * motion[1],
-            poses[:, 1] - sine * motion[0] - cosine * motion[1],
-            turned,
-        ]
-    )
+    x = poses[:, 0] - cosine * motion[0] + sine * motion[1]
+    y = poses[:, 1] - sine * motion[0] - cosine * motion[1]
+    before = np.column_stack([x, y, turned])  # where the robot was if it is now at each view cell
     sides = np.array([CELLS.cell_size, CELLS.cell_size, 2 * np.pi / CELLS.cells_heading])
     if cell:
         poses, before = (np.round(each / (cell * sides)) * cell * sides for each in (poses, before))

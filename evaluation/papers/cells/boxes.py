@@ -9,6 +9,7 @@ maps of all cells are therefore compared as they are and after the best turn and
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ from scipy import fft
 
 from evaluation.cells.rate_map import bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.panels import name_panel, panel_row, table_lines
+from evaluation.papers.cells.panels import name_panel, panel_row
 from evaluation.papers.cells.rat_sessions import RatSessions, column_activity
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
 from tactile.base.se2 import wrap
@@ -175,8 +177,7 @@ def _fit_session(recording: CellRecording, seconds: float, side: float, columns:
         ]
     fits = {
         (kind, pair): fit_maps(maps[kind][k], maps[kind][k + 1], recording.shape[2])
-        for kind in KINDS
-        for k, pair in enumerate(PAIRS)
+        for kind, (k, pair) in product(KINDS, enumerate(PAIRS))
     }
     after = int(np.flatnonzero(part == 2)[0])
     turn = wrap(recording.truth[after - 1, 2] - recording.truth[after, 2])
@@ -204,26 +205,16 @@ def _table_boxes(result: _Boxes) -> list[str]:
         means = [_mean(fits[kind, pair][0][name]) for _, fits, _ in sessions]
         return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
 
+    whole = "far above the control: the sheet turns and shifts as a whole"
     figures = (
         ("A with A", "no shift", "high", "still"),
         ("A with B", "no shift", "about 0: the sheet has turned and shifted", "still"),
-        (
-            "A with B",
-            "best common turn and shift",
-            "far above the control: the sheet turns and shifts as a whole",
-            "best",
-        ),
+        ("A with B", "best common turn and shift", whole, "best"),
     )
-    rows = [
-        [
-            f"{kind}: {pair}, {how}",
-            goal,
-            spread(kind, pair, name),
-            f"{spread(kind, pair, f'shuffled {name}')} shuffled identities",
-        ]
-        for kind in KINDS
-        for pair, how, goal, name in figures
-    ]
+    rows = []
+    for kind, (pair, how, goal, name) in product(KINDS, figures):
+        control = f"{spread(kind, pair, f'shuffled {name}')} shuffled identities"
+        rows.append([f"{kind}: {pair}, {how}", goal, spread(kind, pair, name), control])
     found = ", ".join(f"{np.degrees(wrap(fits['columns', 'A with B'][1])):.0f}" for _, fits, _ in sessions)
     down = ", ".join(f"{np.degrees(turn):.0f}" for _, _, turn in sessions)
     rows.append(["common turn, degrees", "that of setting down", found, f"{down} set down"])
@@ -263,11 +254,8 @@ def _draw_boxes(result: _Boxes, png: Path) -> None:
         return joined[np.isfinite(joined)]
 
     pairs = {
-        title: {
-            "A with A": correlations("A with A", name),
-            "A with B": correlations("A with B", name),
-            "A with B, identities shuffled": correlations("A with B", f"shuffled {name}"),
-        }
+        title: {pair: correlations(pair, name) for pair in PAIRS}
+        | {"A with B, identities shuffled": correlations("A with B", f"shuffled {name}")}
         for title, name in (("as they are", "still"), ("after the best common turn and shift", "best"))
     }
     bins = round(torus / side * maps.shape[2])
@@ -307,8 +295,7 @@ def _draw_boxes(result: _Boxes, png: Path) -> None:
         fontsize=7.5, color=style.LABEL_GREY,
     )  # fmt: skip
     axes = _draw_histograms(figure, pairs)
-    style.add_legend(figure, axes, columns=3)
-    figure.savefig(png)
+    style.add_legend(figure, axes, columns=3).savefig(png)
 
 
 def _draw_histograms(figure: style.Figure, pairs: Mapping[str, Mapping[str, np.ndarray]]) -> style.Axes:

@@ -16,10 +16,11 @@ from evaluation.cells.information import information, information_rate
 from evaluation.cells.rate_map import rate_maps, tuning_curves
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import shuffled_scores
-from evaluation.papers.cells.panels import table_lines, time_call
+from evaluation.papers.cells.panels import time_call
 from evaluation.papers.cells.rat_sessions import SECONDS, record_rat
 from evaluation.papers.cells.shuffles import PLACE_SCORES, path_bins
 from evaluation.papers.figure import Figure
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.studies.cell_study import cell_study, score_task, tasks_of
 from evaluation.studies.machine import one_core, peak_memory, processor_name, reset_peak_memory, watch_load
 
@@ -136,14 +137,11 @@ def _table_networks(result: tuple[str, Times]) -> list[str]:
         "networks", "sets measured", "us a step and set", "wall us", "1,000 sets x 30,000 steps, min",
         "wall min", "goal min", "memory MB",
     )  # fmt: skip
-    return table_lines(
-        [note],
-        columns,
-        (
-            [name, sets, *(f"{time:.1f}" for time in times), goal, f"{memory:.0f}"]
-            for (name, goal), (sets, *times, memory) in zip(GOALS.items(), rows, strict=True)
-        ),
+    cells = (
+        [name, sets, *(f"{time:.1f}" for time in times), goal, f"{memory:.0f}"]
+        for (name, goal), (sets, *times, memory) in zip(GOALS.items(), rows, strict=True)
     )
+    return table_lines([note], columns, cells)
 
 
 NETWORKS = Figure(

@@ -18,17 +18,10 @@ from typing import Any
 import numpy as np
 
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.panels import (
-    error_size,
-    name_panel,
-    panel_grid,
-    shortest,
-    spread_dots,
-    table_lines,
-    torus_error,
-)
+from evaluation.papers.cells import panels
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.plots import style
 from evaluation.studies.network_batch import CellSets, walk
 from evaluation.studies.study_course import StudyCourse, expected_poses, read_course
@@ -108,7 +101,7 @@ def _draw_drift(result: _Drift, png: Path) -> None:
         f"Dots: {len(packets)} seeds, lines: root mean square. "
         f"The packet adds at most {added[..., 0].max():.3f} m, {added[..., 1].max():.3f} rad to odometry."
     )
-    figure, axes = panel_grid("Path integration drift against noise of odometry", line, 2, 2)
+    figure, axes = panels.panel_grid("Path integration drift against noise of odometry", line, 2, 2)
     noise, exact_heading = np.array(list(LEVELS.values())), 1 + len(SPEED)
     columns = (
         ("heading exact", [*range(exact_heading)], "noise of the speed (sqrt(s))"),
@@ -123,36 +116,26 @@ def _draw_drift(result: _Drift, png: Path) -> None:
                 colour = COLOURS[j % len(COLOURS)]
                 panel.plot(levels, packet[:, j], "-", color=colour, lw=1.6, label=f"packet after {time} s")
                 panel.plot(levels, odometry[:, j], "--", color=style.INK, lw=0.9, zorder=3)
-                spread_dots(panel, levels, packets[:, rows, j, quantity].T.tolist(), colour)
+                panels.spread_dots(panel, levels, packets[:, rows, j, quantity].T.tolist(), colour)
             panel.plot([], [], "--", color=style.INK, lw=0.9, label="odometry (control)")
             panel.set_ylim(0, max(panel.get_ylim()[1], LEAST))
-            name_panel(panel, "" if quantity else title, across, up)
-    style.add_legend(figure, axes[0][0], columns=6)
-    figure.savefig(png)
+            panels.name_panel(panel, "" if quantity else title, across, up)
+    style.add_legend(figure, axes[0][0], columns=6).savefig(png)
 
 
 def _errors_of(seed: int, times: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[L, M, 2] errors of packets, of odometry, and of packets against odometry."""
-    study = _course(seed, times[-1])
+    exact, seconds = "odometry={speed_white: 0.0, heading_white: 0.0}", times[-1] + 1
+    rat = f"seconds={seconds}", f"rate_hz={RATE}", f"seed={seed}", "walk={}", exact, "views.every=1000"
+    config = rat_config(*(f"rat_simulation.{setting}" for setting in rat))
+    study = read_course(config, round(seconds * RATE), False, 2, (0,), seed)
     at = np.round(np.array(times) * RATE).astype(int)
     packets, odometry = _packets(study)[:, at], _odometry(study)[:, at]
     true = study.expected[at]
     unit = units(study.config, np.dtype(float))
     pairs = (packets, true), (odometry, true), (packets, odometry)
-    packet, alone, added = (error_size((a - b) * unit) for a, b in pairs)
+    packet, alone, added = (panels.error_size((a - b) * unit) for a, b in pairs)
     return packet, alone, added
-
-
-def _course(seed: int, seconds: int) -> StudyCourse:
-    config = rat_config(
-        f"rat_simulation.seconds={seconds + 1}",
-        f"rat_simulation.rate_hz={RATE}",
-        f"rat_simulation.seed={seed}",
-        "rat_simulation.walk={}",
-        "rat_simulation.odometry={speed_white: 0.0, heading_white: 0.0}",
-        "rat_simulation.views.every=1000",
-    )
-    return read_course(config, round((seconds + 1) * RATE), False, 2, (0,), seed)
 
 
 def _packets(study: StudyCourse) -> np.ndarray:
@@ -229,7 +212,7 @@ def measure_anchoring(task: Task, schedule: _Schedule = SCHEDULE) -> _Anchoring:
             for seed in task.seeds(ANCHORING_USUAL)
         ]
         for test in TESTS:
-            error[path, test] = np.array([error_size(torus_error(each[test])) for each in runs])
+            error[path, test] = np.array([panels.error_size(panels.torus_error(each[test])) for each in runs])
             again[path, test] = np.array(
                 [_anchored_after(each[test], each["light"], schedule[1]) for each in runs]
             )
@@ -240,7 +223,7 @@ def _anchored_after(run: CellRecording, light: CellRecording, back: float) -> fl
     """Time from the return of the light until the packet is and stays near to that of the session of the same
     seed in light throughout, s; inf if it does not."""
     apart = run.packet_pose - light.packet_pose
-    far = np.any(error_size(shortest(run, apart)) > NEAR, axis=1)[round(back * RATE) :]
+    far = np.any(panels.error_size(panels.shortest(run, apart)) > NEAR, axis=1)[round(back * RATE) :]
     held = round(HELD * RATE)
     windows = np.lib.stride_tricks.sliding_window_view(far, held)
     near = np.flatnonzero(~windows.any(axis=1))
@@ -283,7 +266,7 @@ def _draw_anchoring(result: _Anchoring, png: Path) -> None:
     line = "Median error in the test: " + ", ".join(
         f"{test} {m:.2f} m, {rad:.2f} rad" for test, (m, rad) in during.items()
     )
-    figure, axes = panel_grid("Anchoring of the packet by views", f"{line}.", 2, 2)
+    figure, axes = panels.panel_grid("Anchoring of the packet by views", f"{line}.", 2, 2)
     for column, path in enumerate(PATHS):
         for quantity, up in enumerate(("error of position (m)", "error of heading (rad)")):
             panel = axes[quantity][column]
@@ -297,9 +280,8 @@ def _draw_anchoring(result: _Anchoring, png: Path) -> None:
             panel.set_xlim(0, end)
             panel.set_ylim(bottom=0)
             title = "path of a real rat" if path == "sargolini" else "random walk"
-            name_panel(panel, "" if quantity else title, "time (s)", up)
-    style.add_legend(figure, axes[0][0])
-    figure.savefig(png)
+            panels.name_panel(panel, "" if quantity else title, "time (s)", up)
+    style.add_legend(figure, axes[0][0]).savefig(png)
 
 
 def _draw_curve(axes: style.Axes, error: np.ndarray, test: str) -> None:

@@ -6,7 +6,7 @@ columns under a title, in the style of all plots. Processor and wall time of cal
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from time import perf_counter, process_time
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,6 @@ import numpy as np
 
 from evaluation.cells.decoding import truth_in_sheet
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.plots import style
 
 if TYPE_CHECKING:
@@ -37,14 +36,6 @@ def shortest(recording: CellRecording, difference: np.ndarray) -> np.ndarray:
 def error_size(error: np.ndarray) -> np.ndarray:
     """[..., 2] distance (m) and angle (rad, not negative) of errors [..., 3]."""
     return np.stack([np.hypot(error[..., 0], error[..., 1]), np.abs(error[..., 2])], axis=-1)
-
-
-def table_lines(
-    above: Sequence[str], columns: Sequence[str], rows: Iterable[Iterable[object]], below: Sequence[str] = ()
-) -> list[str]:
-    """The lines of a table, with sentences above and below it."""
-    head = [*above, "", *markdown_header(columns).splitlines(), *map(markdown_row, rows)]
-    return [*head, "", *below] if below else head
 
 
 TOP, BOTTOM = 1.15, 0.85

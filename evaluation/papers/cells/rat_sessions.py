@@ -10,7 +10,7 @@ import numpy as np
 from evaluation.cells.recording import CellRecording
 from ratslam.core.session import Session
 from ratslam.runs.build_session import build_session, open_observations, read_observations
-from ratslam.runs.cell_recorder import CellSums, plan_recording
+from ratslam.runs.cell_recorder import CellSums, plan_recording, step_columns
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from robot.simulation.rat.simulated_session import RatSimulation, RatSimulationConfig
 from robot.sources.source import Source
@@ -75,25 +75,13 @@ class RatSessions:
         rows = list(read_observations(source))
         samples = [sample for sample, _ in rows]
         steps = list(self._session.replay([observation for _, observation in rows]))
-        cells, summed = plan.cells, None
+        cells, sums = plan.cells, None
         if plan.bins is not None:
             summed = CellSums(plan.bins, int(np.prod(cells.shape)), samples[0].time)
-            for sample, step in zip(samples, steps, strict=True):
-                if step.seldom is not None:
-                    summed.add(sample.time, sample.truth, *cells.active(step.seldom))
-        unknown = np.full(3, np.nan)
-        return CellRecording(
-            shape=cells.shape,
-            cell_size=cells.cell_size,
-            time=np.array([sample.time for sample in samples]),
-            truth=np.array([unknown if sample.truth is None else sample.truth for sample in samples]),
-            packet=np.array([cells.packet(step.evidence) for step in steps]),
-            energy=np.array([cells.energy(step.evidence) for step in steps]),
-            place=np.array([step.estimate.place for step in steps], np.int32),
-            cell=plan.cell,
-            activity=np.array([step.probed for step in steps], np.float32),
-            sums=None if summed is None else summed.result(),
-        )
+            summed.add_steps(cells, samples, steps)
+            sums = summed.result()
+        columns = step_columns(cells, samples, steps)
+        return CellRecording(cells.shape, cells.cell_size, **columns, cell=plan.cell, sums=sums)
 
 
 def rat_config(*assignments: str) -> RunConfig:

@@ -18,16 +18,10 @@ from evaluation.cells.decoding import truth_in_sheet
 from evaluation.cells.head_direction import preferred_direction
 from evaluation.cells.rate_map import bin_activity, tuning_curves
 from evaluation.cells.recording import CellRecording
-from evaluation.papers.cells.panels import (
-    name_panel,
-    panel_grid,
-    shortest,
-    spread_dots,
-    table_lines,
-    torus_error,
-)
+from evaluation.papers.cells.panels import name_panel, panel_grid, shortest, spread_dots, torus_error
 from evaluation.papers.cells.rat_sessions import RatSessions, rat_config
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.plots import style
 from tactile.base.se2 import wrap
 
@@ -54,14 +48,8 @@ DARK = {"dark": True}
 EDGES = np.array([0.0, 1.0])
 """Of the box, m."""
 COLUMNS = (
-    "cues",
-    "turn deg",
-    "heading of packet deg",
-    "place of packet deg",
-    "cells deg",
-    "gain",
-    "expected",
-)
+    "cues", "turn deg", "heading of packet deg", "place of packet deg", "cells deg", "gain", "expected",
+)  # fmt: skip
 
 
 SCHEDULE = (90.0, 110.0, 140.0)
@@ -83,15 +71,8 @@ heading at each step."""
 def measure_rotation(task: Task, schedule: _Schedule = SCHEDULE) -> _Rotations:
     """The rotations of all conditions and seeds."""
     turned_at, _, end = schedule
-    sessions = RatSessions(
-        rat_config(
-            f"rat_simulation.rate_hz={RATE}",
-            "rat_simulation.views.every=1",
-            "rat_simulation.walk={}",
-            "session.reserve=256",
-            f"cells.chosen={CELLS}",
-        )
-    )
+    rat = f"rat_simulation.rate_hz={RATE}", "rat_simulation.views.every=1", "rat_simulation.walk={}"
+    sessions = RatSessions(rat_config(*rat, "session.reserve=256", f"cells.chosen={CELLS}"))
     found, courses = [], []
     for _, degrees, phase in CONDITIONS:
         phases = [{"start": turned_at, **phase}] if phase else []
@@ -182,8 +163,7 @@ def _draw_rotation(result: _Rotations, png: Path) -> None:
     right.set_xlim(turned_at / 2, end)
     right.legend(frameon=False, fontsize=8, labelcolor=style.INK, loc="upper left")
     name_panel(right, "heading of the packet over time, median", "time (s)", "rotation (deg)")
-    style.add_legend(figure, left, columns=5)
-    figure.savefig(png)
+    style.add_legend(figure, left, columns=5).savefig(png)
 
 
 def _spread(values: np.ndarray, digits: int) -> str:

@@ -8,6 +8,7 @@ from typing import get_args
 
 import numpy as np
 
+from evaluation.cells import rate_map
 from evaluation.cells.fields import border_score, largest_field
 from evaluation.cells.grid_score import HEXAGONAL, SQUARE, autocorrelogram, lattice_scores
 from evaluation.cells.head_direction import mean_vector_length, rayleigh_z
@@ -18,19 +19,11 @@ from evaluation.cells.information import (
     selectivity,
     sparsity,
 )
-from evaluation.cells.rate_map import (
-    arena_edges,
-    coherence,
-    heading_index,
-    place_index,
-    sample_seconds,
-    smooth_rates,
-)
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import Calibration, PathBins, Score, calibrate, shuffled_scores
-from evaluation.papers.cells.panels import table_lines
 from evaluation.papers.cells.rat_sessions import SECONDS, Way, record_rat
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.studies.executor import run_tasks
 
 CELLS, TRUE_CELLS, SHUFFLES = 500, 100, 100
@@ -46,17 +39,14 @@ _Row = tuple[Way, str, Calibration, float, float]
 score."""
 
 
-def check_shuffles(
-    task: Task, cells: int = CELLS, shuffles: int = SHUFFLES, seconds: float = SECONDS
-) -> tuple[str, list[_Row]]:
+def check_shuffles(task: Task, shuffles: int = SHUFFLES, seconds: float = SECONDS) -> tuple[str, list[_Row]]:
     """Compares cells of a session with their shuffles, for every score and path; what is compared, as
     sentences, and the rows.
 
     Args:
-        task: its sessions are the cells of the calibration. cells: where the task does not say. shuffles: of
-            each cell. seconds: of the session.
+        task: its sessions are the cells of the calibration. shuffles: of each cell. seconds: of the session.
     """
-    cells = task.sessions or cells
+    cells = task.sessions or CELLS
     true_cells = min(cells, TRUE_CELLS)
     tasks = []
     for way in get_args(Way):
@@ -92,10 +82,8 @@ def _shuffle_table(result: tuple[str, list[_Row]]) -> list[str]:
             f"{100 * each:.1f} %" for each in (cells.share, cells.low, cells.high, cells.tied, true_share)
         )
         within = "yes" if cells.low <= cells.share <= cells.high else "**no**"
-        means = f"{cells.shuffled_mean:.3g}", f"{true_mean:.3g}"
-        rows.append(
-            [way, score, cells.cells, share, f"{low} - {high}", within, tied, means[0], true, means[1]]
-        )
+        shuffled = cells.cells, share, f"{low} - {high}", within, tied, f"{cells.shuffled_mean:.3g}"
+        rows.append([way, score, *shuffled, true, f"{true_mean:.3g}"])
     return table_lines([note], COLUMNS, rows)
 
 
@@ -108,7 +96,7 @@ SMOOTHING = 1.5
 
 def _smoothed(score: Score) -> Score:
     """The score of the smoothed map."""
-    return lambda rates, seconds: score(smooth_rates(rates, seconds, SMOOTHING), seconds)
+    return lambda rates, seconds: score(rate_map.smooth_rates(rates, seconds, SMOOTHING), seconds)
 
 
 PLACE_SCORES: Mapping[str, Score] = {
@@ -116,7 +104,7 @@ PLACE_SCORES: Mapping[str, Score] = {
     "information rate": _smoothed(information_rate),
     "1 - sparsity": _smoothed(lambda rates, seconds: 1 - sparsity(rates, seconds)),
     "selectivity": _smoothed(selectivity),
-    "coherence": coherence,
+    "coherence": rate_map.coherence,
     "largest field": _smoothed(largest_field),
     "border score": _smoothed(border_score),
     "grid score": _smoothed(lambda rates, seconds: lattice_scores(autocorrelogram(rates), HEXAGONAL)),
@@ -140,9 +128,9 @@ def path_bins(recording: CellRecording, kind: str) -> PathBins:
     """The bin of each step by a kind of `SCORES`: of place, 20 x 20 over the box that the path fills; of
     heading, 36; or of both, 8 x 10 x 10."""
     turns, across = (8, 10) if kind == "joint" else (36, 20)
-    seconds = sample_seconds(recording.time)
-    place = place_index(recording.truth, *arena_edges(recording.truth, across))
-    heading = heading_index(recording.truth, turns)
+    seconds = rate_map.sample_seconds(recording.time)
+    place = rate_map.place_index(recording.truth, *rate_map.arena_edges(recording.truth, across))
+    heading = rate_map.heading_index(recording.truth, turns)
     if kind == "place":
         return PathBins(place, (across, across), seconds)
     if kind == "heading":

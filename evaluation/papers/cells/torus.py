@@ -26,9 +26,10 @@ from evaluation.cells.grid_score import (
 from evaluation.cells.rate_map import place_index, sample_seconds, smooth_rates
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import PathBins, ShuffledScores, shuffled_scores
-from evaluation.papers.cells.panels import panel_row, table_lines
+from evaluation.papers.cells.panels import panel_row
 from evaluation.papers.cells.rat_sessions import RatSessions, column_activity
 from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.plots import style
 from ratslam.core.compilation import prepare_precision
 
@@ -190,22 +191,31 @@ def _draw_torus(result: _Torus, png: Path) -> None:
         lags = autocorrelogram(shown)
         x, y = box.size
         reach_y, reach_x = (box.bin * side / 2 for side in lags.shape[1:])
+        reach = -reach_x, reach_x, -reach_y, reach_y
         for name, images, extent, colours in (
             (f"rates, box {_ratio(box, torus)} of the torus", rates, (0, x, 0, y), ("viridis", 0, 1)),
-            (
-                "autocorrelograms over lags of x and y (m)",
-                lags,
-                (-reach_x, reach_x, -reach_y, reach_y),
-                ("RdBu_r", -1, 1),
-            ),
+            ("autocorrelograms over lags of x and y (m)", lags, reach, ("RdBu_r", -1, 1)),
         ):
             top -= HEAD
             figure.text(style.LEFT / style.WIDTH, (top + 0.08) / height, name, fontsize=9, color=style.INK)
             top -= tall
-            _draw_row(figure, top, tall, images, extent, colours)
+            palette, low, high = colours
+            for column, values in enumerate(images):
+                axes = style.add_axes(figure, style.LEFT + column * (WIDE + GAP), top, WIDE, tall)
+                image = axes.imshow(values, origin="lower", extent=extent, cmap=palette, vmin=low, vmax=high)
+                axes.set(xticks=[round(extent[0], 1), round(extent[1], 1)], yticks=[])
+                axes.tick_params(labelsize=7, pad=1)
+                labels = axes.get_xticklabels()
+                labels[0].set_horizontalalignment("left")
+                labels[-1].set_horizontalalignment("right")
+                if column == 0:
+                    axes.set_yticks([round(extent[2], 1), round(extent[3], 1)])
+            bar = style.add_axes(figure, style.LEFT + len(images) * (WIDE + GAP), top, BAR, tall)
+            figure.colorbar(image, cax=bar, ticks=(low, high))
+            label = "rate / peak" if low == 0 else "correlation"
+            bar.set_ylabel(label, fontsize=8, color=style.LABEL_GREY, labelpad=1)
     axes = _draw_histograms(figure, scores, large.spacing, torus)
-    style.add_legend(figure, axes, columns=2)
-    figure.savefig(png)
+    style.add_legend(figure, axes, columns=2).savefig(png)
 
 
 def _ratio(found: _LatticeFigures, torus: float) -> str:
@@ -243,30 +253,6 @@ HEIGHT, LOW, HEAD = 1.6, 0.95, 0.42
 
 SCORES = np.linspace(-1.5, 1.5, 61).tolist()
 """Limits of the bins of lattice scores."""
-
-
-def _draw_row(
-    figure: style.Figure, bottom: float, tall: float, images: np.ndarray,
-    extent: tuple[float, float, float, float],
-    colours: tuple[str, float, float],
-) -> None:  # fmt: skip
-    name, low, high = colours
-    for column, values in enumerate(images):
-        axes = style.add_axes(figure, style.LEFT + column * (WIDE + GAP), bottom, WIDE, tall)
-        image = axes.imshow(values, origin="lower", extent=extent, cmap=name, vmin=low, vmax=high)
-        axes.set(xticks=[round(extent[0], 1), round(extent[1], 1)], yticks=[])
-        axes.tick_params(labelsize=7, pad=1)
-        labels = axes.get_xticklabels()
-        labels[0].set_horizontalalignment("left")
-        labels[-1].set_horizontalalignment("right")
-        if column == 0:
-            axes.set_yticks([round(extent[2], 1), round(extent[3], 1)])
-    left = style.LEFT + len(images) * (WIDE + GAP)
-    bar = style.add_axes(figure, left, bottom, BAR, tall)
-    figure.colorbar(image, cax=bar, ticks=(low, high))
-    label = "rate / peak" if low == 0 else "correlation"
-    bar.yaxis.set_label_position("right")
-    bar.set_ylabel(label, fontsize=8, color=style.LABEL_GREY, labelpad=1)
 
 
 def _draw_histograms(

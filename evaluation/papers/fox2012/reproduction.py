@@ -17,27 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evaluation.metrics import occupancy_score
 from evaluation.metrics.occupancy_grid import OccupancyGrid, mean_grid
-from evaluation.metrics.occupancy_score import (
-    CONVENTIONS,
-    DISTINCT_CONVENTIONS,
-    MAIN_CONVENTION,
-    Convention,
-    GridScore,
-    pool_grids,
-    render_grid_scores,
-    score_grid,
-)
+from evaluation.metrics.occupancy_score import DISTINCT_CONVENTIONS, MAIN_CONVENTION, Convention, score_grid
 from evaluation.metrics.statistics import bootstrap
 from evaluation.metrics.trajectory import position_error
+from evaluation.papers import trial_sessions as trials
 from evaluation.papers.paper_sets import Paper, ResultRow, column, count_sets, run_with_progress
-from evaluation.papers.trial_sessions import (
-    collect_marks,
-    draw_map,
-    observe_session,
-    run_filter,
-    simulate_session,
-)
 from evaluation.plots import style
 from evaluation.plots.grid_plot import GridPanel, draw_grids
 from ratslam.runs.run_directory import true_grid
@@ -165,7 +151,7 @@ _MAP_METRICS = (
 )  # fmt: skip
 FIELDS = (
     "reports", "online_error", "final_error", "online_heading_error_deg", "revisits", "revisits_closed",
-    "revisit_gap", "odometry_error", *(each.column for each in CONVENTIONS), *_MAP_METRICS,
+    "revisit_gap", "odometry_error", *(each.column for each in occupancy_score.CONVENTIONS), *_MAP_METRICS,
 )  # fmt: skip
 """Columns of metrics in NAME.csv."""
 
@@ -203,13 +189,11 @@ def _render_results(protocol: _Protocol, rows: Sequence[ResultRow], sets: int) -
     lines += [_LEGEND, ""]
     if set(PAPERS) <= set(protocol.mappers) and done > 1:
         for method in METHODS:
-            scores = [
-                pool_grids(
-                    [row.session.score for row in rows if row.key[1:] == (method, mapper, FILTERED)], mapper
-                )
-                for mapper in protocol.mappers
-            ]
-            lines += [f"{method.capitalize()}:", render_grid_scores(scores), ""]
+            scores = []
+            for mapper in protocol.mappers:
+                found = [row.session.score for row in rows if row.key[1:] == (method, mapper, FILTERED)]
+                scores.append(occupancy_score.pool_grids(found, mapper))
+            lines += [f"{method.capitalize()}:", occupancy_score.render_grid_scores(scores), ""]
             lines += [*render_rankings(method, rows), ""]
     return "\n".join([*lines, protocol.note])
 
@@ -352,7 +336,7 @@ class _MapResult(NamedTuple):
     """The map and the paths [T, 3] of a row, in the frame of the arena; `stop` is the index of its stop."""
 
     stop: int
-    score: GridScore
+    score: occupancy_score.GridScore
     grid: OccupancyGrid
     arena: Arena
     truth: np.ndarray
@@ -394,7 +378,7 @@ def run_job(job: _SessionJob) -> list[ResultRow]:
     """
     some = next(iter(job.variants.values()))
     assert some.create_simulation is not None
-    session = simulate_session(some.create_simulation)
+    session = trials.simulate_session(some.create_simulation)
     count = len(session.truth)
     stops = tuple(min(stop, count) if stop else count for stop in job.stops)
 
@@ -415,14 +399,14 @@ def run_job(job: _SessionJob) -> list[ResultRow]:
 
     rows: list[ResultRow] = []
     for variant, config in job.variants.items():
-        reports = observe_session(config, session, job.training)
-        marks = collect_marks(reports)
+        reports = trials.observe_session(config, session, job.training)
+        marks = trials.collect_marks(reports)
         feelers = report_config_of(session.source.info, config.touch.reports).feelers
-        for stop, filtered in enumerate(run_filter(config, session, reports, stops)):
+        for stop, filtered in enumerate(trials.run_filter(config, session, reports, stops)):
             ways = {FILTERED: filtered}
             for name, whole in ((RECKONED, session.odometry), (TRUE, session.truth)):
                 path = whole[: stops[stop]]
-                ways[name] = path, path, draw_map(config.grid, feelers, session.arena, path, marks)
+                ways[name] = path, path, trials.draw_map(config.grid, feelers, session.arena, path, marks)
             rows += [score((*variant, name), stop, *way) for name, way in ways.items()]
     return rows
 

@@ -8,7 +8,6 @@ another error of the wheels.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -28,6 +27,7 @@ from ratslam.runs.saved_map import describe_readings, read_map, write_map
 from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from robot.touch_source import observation_of, open_touch_source
+from tactile.base.files import write_atomically
 from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
 from tactile.base.types import Observation
@@ -116,14 +116,11 @@ def _arena_lines(found: Sequence[Measured]) -> list[str]:
 def _draw_arenas(found: Sequence[Measured], png: Path) -> None:
     """Draws the error of all sessions over the reports."""
     known, other = count(~column(found, "missed")), count(column(found, "found_elsewhere"))
-    draw_panels(
-        png,
-        "Waking up in a known arena",
-        f"Unknown start: found and right in {known}; found in another arena: {other}.",
-        ("error while found, m", "reports since the start"),
-        curves={"sessions": [one.shown["curve"] for one in found]},
-        limits={"right": RIGHT.distance, "wrong": WRONG.distance},
-    )
+    line = f"Unknown start: found and right in {known}; found in another arena: {other}."
+    names = "error while found, m", "reports since the start"
+    curves = {"sessions": [one.shown["curve"] for one in found]}
+    limits = {"right": RIGHT.distance, "wrong": WRONG.distance}
+    draw_panels(png, "Waking up in a known arena", line, names, curves=curves, limits=limits)
 
 
 GRID = Figure("Localise in a grid map from an unknown start", _measure_arena, _arena_lines, _draw_arenas, 20)
@@ -140,14 +137,8 @@ def _arena_config(arena: int, side: float, seed: int) -> RunConfig:
     """
     wheels = {"noise": "bias", "level": 0.05}
     simulation = {"arena": {"side": side, "seed": arena}, "wheels": wheels, "reports": REPORTS, "seed": seed}
-    return RunConfig.model_validate(
-        {
-            "create_simulation": simulation,
-            "backend": "grid",
-            "session": {"precision": "float32"},
-            "grid": {"side": MAP_SIDE * side},
-        }
-    )
+    method = {"backend": "grid", "session": {"precision": "float32"}, "grid": {"side": MAP_SIDE * side}}
+    return RunConfig.model_validate({"create_simulation": simulation, **method})
 
 
 def _drive_elsewhere(arena: int, side: float) -> tuple[list[Observation], np.ndarray, np.ndarray]:
@@ -185,8 +176,7 @@ def store_arena_map(arena: int, side: float, folder: Path) -> tuple[Path, MapSte
                 pass
             write_map(path, session, config, describe_readings(source), recording=source.digest)
         truth = np.array([sample.truth for sample in samples])
-        unfinished = beside.with_name(f".{os.getpid()}.npz")
-        np.savez(unfinished, trajectory=session.map.trajectory(), truth=truth)
-        unfinished.replace(beside)
+        poses = session.map.trajectory()
+        write_atomically(beside, lambda unfinished: np.savez(unfinished, trajectory=poses, truth=truth))
     with np.load(beside) as saved:
         return path, MapSteps.known(saved["trajectory"], saved["truth"])

@@ -45,13 +45,9 @@ def _measure_change(change: Callable[[int], tuple[Recipe, np.ndarray]], task: Ma
         "far_places": int((distance > CELL_SIDE).sum()),
         "false_alarm": unchanged > 0,
     }
-    marks = [("truly changed", places), ("named", named)]
-    paths = PathPanel(
-        "maze of the map, path after the change",
-        scenarios.open_world(task.seed)[0],
-        {"path": driven.truth[:, :2]},
-        marks,
-    )
+    maze, marks = scenarios.open_world(task.seed)[0], [("truly changed", places), ("named", named)]
+    path = {"path": driven.truth[:, :2]}
+    paths = PathPanel("maze of the map, path after the change", maze, path, marks)
     return Measured(figures, {"unchanged": unchanged, "distance": distance, "paths": paths})
 
 
@@ -73,18 +69,12 @@ def _change_lines(found: Sequence[Measured]) -> list[str]:
 def _draw_change(title: str, found: Sequence[Measured], png: Path) -> None:
     """Draws one changed maze with the places named, and their distances in all."""
     distances = [one.shown["distance"] for one in found]
-    draw_panels(
-        png,
-        title,
-        f"Surest place within a cell of the change: {count(~column(found, 'not_named'))}.",
-        ("distance from the true change, m", "places named"),
-        dots={
-            "surest": [each[0] for each in distances if len(each)],
-            "others": [value for each in distances for value in each[1:]],
-        },
-        limits={"a cell": CELL_SIDE},
-        paths=found[0].shown["paths"],
-    )
+    line = f"Surest place within a cell of the change: {count(~column(found, 'not_named'))}."
+    names = "distance from the true change, m", "places named"
+    others = [value for each in distances for value in each[1:]]
+    dots = {"surest": [each[0] for each in distances if len(each)], "others": others}
+    limits, paths = {"a cell": CELL_SIDE}, found[0].shown["paths"]
+    draw_panels(png, title, line, names, dots=dots, limits=limits, paths=paths)
 
 
 WALL, DOOR = (
@@ -169,14 +159,10 @@ def _draw_carried(found: Sequence[Measured], png: Path) -> None:
     one = next((each for each in found if each.shown["known"].joined), found[0])
     wrong = sum(each.shown[name].wrong for each in found for name in ("known", "unknown"))
     right = count(~column(found, "not_tied"))
-    draw_panels(
-        png,
-        "Carried away, and continued",
-        f"Tied on rightly after {REENTERED} whisks in the known part: {right}; wrong ties: {wrong}.",
-        ("error of tied sessions, m", "part in which the session continues"),
-        dots={name: [each.shown[name].off for each in found] for name in PARTS},
-        paths=one.shown["paths"],
-    )
+    line = f"Tied on rightly after {REENTERED} whisks in the known part: {right}; wrong ties: {wrong}."
+    names = "error of tied sessions, m", "part in which the session continues"
+    dots = {name: [each.shown[name].off for each in found] for name in PARTS}
+    draw_panels(png, "Carried away, and continued", line, names, dots=dots, paths=one.shown["paths"])
 
 
 def _draw_kidnaps(found: Sequence[Measured], png: Path) -> None:

@@ -68,8 +68,8 @@ class VirtualArm:
         self._setup = HeadSetup(surroundings.head, plan.stream, plan.mechanics, plan.whisking)
         self._random = stream(plan.seed, "live.sensor")
         self._odometer = ArmOdometry(config)
+        self.poses: list[np.ndarray] = []
         self._remember()
-        self.poses = [self._pose()]
 
     def move(self, tcp: np.ndarray, speed: float | None = None) -> None:
         """Starts a straight move; it replaces the present one.
@@ -97,7 +97,6 @@ class VirtualArm:
             self._arm.step(self._dt)
             self.time += self._dt
             self._remember()
-            self.poses.append(self._pose())
         steps = np.array(self.poses[first:])
         steps[:, 2] = np.unwrap(steps[:, 2])
         path = HeadPath(np.linspace(begin, self.time, len(steps)), steps)
@@ -112,12 +111,10 @@ class VirtualArm:
         while True:
             yield self.whisk()
 
-    def _pose(self) -> np.ndarray:
-        return self._config.arm.placing.pose_from_tcp(np.array(self._arm.state.tcp))[0]
-
     def _remember(self) -> None:
         state = self._arm.state
         self._odometer.add(np.array([self.time]), np.array([state.tcp]), np.array([state.speed]))
+        self.poses.append(self._config.arm.placing.pose_from_tcp(np.array(state.tcp))[0])
 
 
 PAIRS, WALLS = 20, 5
@@ -360,21 +357,16 @@ def goal_figures(
     }
     gap = np.full((1, 2), np.nan)  # between the paths of two drives
     driven = np.concatenate([gap, *(np.concatenate([drive.path, gap]) for drive in free)])
-    paths = PathPanel(
-        "drives to goals, without a wall in the way",
-        maze,
-        {"map": mapped, "drives": driven},
-        [("goals", np.array([drive.goal for drive in free]).reshape(-1, 2))],
-    )
+    goals, ways = np.array([drive.goal for drive in free]).reshape(-1, 2), {"map": mapped, "drives": driven}
+    paths = PathPanel("drives to goals, without a wall in the way", maze, ways, [("goals", goals)])
     return Measured(figures, {"free": free, "walled": walled, "mapping": least, "paths": paths})
 
 
 def _goal_lines(found: Sequence[Measured]) -> list[str]:
     free, walled = ([drive for one in found for drive in one.shown[name]] for name in ("free", "walled"))
     n, drives, done = len(free), free + walled, [one for one in free if one.said_reached]
-    ratio = np.array([one.length for one in done]).sum() / max(
-        np.array([one.shortest for one in done]).sum(), 1e-9
-    )
+    driven, shortest = np.array([(one.length, one.shortest) for one in done]).reshape(-1, 2).T
+    ratio = driven.sum() / max(shortest.sum(), 1e-9)
     return table(
         f"reached (truly within {RIGHT.distance:g} m) | {n} of {n} | {count([one.reached for one in free])}"
         f" | {count([one.reckoned <= RIGHT.distance for one in free])} by odometry alone,"
@@ -401,19 +393,15 @@ def _goal_lines(found: Sequence[Measured]) -> list[str]:
 def _draw_goals(found: Sequence[Measured], png: Path) -> None:
     """Draws the drives of one maze, and how far from the goals all of them ended."""
     free = [drive for one in found for drive in one.shown["free"]]
-    draw_panels(
-        png,
-        "Driving to goals on a map of touch",
-        f"One map, then goal after goal: reached {count([drive.reached for drive in free])}.",
-        ("distance from the goal at the end, m", ""),
-        dots={
-            "whiskers": [drive.error for drive in free if drive.said_reached],
-            "odometry": [drive.reckoned for drive in free],
-            "exact arm": [drive.by_arm for drive in free],
-        },
-        limits={"right": RIGHT.distance},
-        paths=found[0].shown["paths"],
-    )
+    title = "Driving to goals on a map of touch"
+    line = f"One map, then goal after goal: reached {count([drive.reached for drive in free])}."
+    names, limits = ("distance from the goal at the end, m", ""), {"right": RIGHT.distance}
+    dots = {
+        "whiskers": [drive.error for drive in free if drive.said_reached],
+        "odometry": [drive.reckoned for drive in free],
+        "exact arm": [drive.by_arm for drive in free],
+    }
+    draw_panels(png, title, line, names, dots=dots, limits=limits, paths=found[0].shown["paths"])
 
 
 GOALS = Figure("Drive to goals on a map", _measure_goals, _goal_lines, _draw_goals, 1)

@@ -35,14 +35,9 @@ class Judged(NamedTuple):
     @classmethod
     def of(cls, steps: MapSteps, localised: Localised, truth: np.ndarray) -> Self:
         """A session beside its true poses [T, 3]."""
-        error = steps.errors(localised.pose, truth, RIGHT.distance)
-        return cls(
-            found=localised.found,
-            foreign=localised.foreign,
-            right=localised.found & RIGHT.holds(error),
-            wrong=localised.found & WRONG.exceeded(error),
-            error=error,
-        )
+        found, error = localised.found, steps.errors(localised.pose, truth, RIGHT.distance)
+        right, wrong = found & RIGHT.holds(error), found & WRONG.exceeded(error)
+        return cls(found, localised.foreign, right, wrong, error)
 
     @property
     def whisks(self) -> float:
@@ -122,15 +117,12 @@ def _draw_start(found: Sequence[Measured], png: Path) -> None:
     """Draws one session in its maze, and the error of all over the whisks."""
     one, whisks = found[0].shown, column(found, "whisks")
     known = count(whisks <= LOCALISED)
-    draw_panels(
-        png,
-        "Waking up in a known maze",
-        f"Unknown start: found and right in {known}, in the median after {np.median(whisks):.0f} whisks.",
-        ("error while found, m", "whisks since the start"),
-        curves={"sessions": [each.shown["curve"] for each in found]},
-        limits={"right": RIGHT.distance, "wrong": WRONG.distance},
-        paths=PathPanel("where the robot was, and where it says it is", one["maze"], one["paths"]),
-    )
+    line = f"Unknown start: found and right in {known}, in the median after {np.median(whisks):.0f} whisks."
+    names = "error while found, m", "whisks since the start"
+    curves = {"sessions": [each.shown["curve"] for each in found]}
+    limits = {"right": RIGHT.distance, "wrong": WRONG.distance}
+    paths = PathPanel("where the robot was, and where it says it is", one["maze"], one["paths"])
+    draw_panels(png, "Waking up in a known maze", line, names, curves=curves, limits=limits, paths=paths)
 
 
 def _draw_foreign(found: Sequence[Measured], png: Path) -> None:

@@ -14,16 +14,8 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from evaluation.papers.figure import Figure
+from evaluation.papers.maps import localisation_metrics as metrics
 from evaluation.papers.maps import scenarios
-from evaluation.papers.maps.localisation_metrics import (
-    BUILDING,
-    RIGHT,
-    SAME_HEADING,
-    WRONG,
-    MapSteps,
-    Tolerance,
-    pose_errors,
-)
 from evaluation.papers.maps.operations import MapTask, Measured, column
 from evaluation.papers.maps.pictures import PathPanel, at_least, count, draw_panels, spread, table
 from evaluation.papers.maps.scenarios import Recipe, record
@@ -34,7 +26,7 @@ from ratslam.runs.settings.run_config import load_config
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, integrate, inverse
 
-REVISIT = Tolerance(RIGHT.distance, float(SAME_HEADING))
+REVISIT = metrics.Tolerance(metrics.RIGHT.distance, float(metrics.SAME_HEADING))
 """A later step is a revisit of an earlier one that is as near as this."""
 
 
@@ -62,12 +54,12 @@ class Join(NamedTuple):
         first, last = slice(earlier), slice(earlier + entry, None)
         piece = _most_common(arrays.piece[first])
         inside = arrays.piece[first] == piece
-        steps = MapSteps.known(arrays.trajectory[first][inside], arrays.truth[first][inside])
+        steps = metrics.MapSteps.known(arrays.trajectory[first][inside], arrays.truth[first][inside])
         pose, truth = arrays.trajectory[last], arrays.truth[last]
         if revisits:
             again = steps.revisited(truth, REVISIT)
             pose, truth = pose[again], truth[again]
-        error = steps.errors(pose, truth, RIGHT.distance)
+        error = steps.errors(pose, truth, metrics.RIGHT.distance)
         known = np.isfinite(error).all(axis=1)
         middle = np.median(error[known], axis=0) if known.any() else np.full(2, np.nan)
         path = steps.align(arrays.trajectory[earlier:])[:, :2]
@@ -81,7 +73,7 @@ class Join(NamedTuple):
     @property
     def wrong(self) -> bool:
         """Joined, and off by more than `WRONG`."""
-        return self.joined and bool(WRONG.exceeded(self.error[None])[0])
+        return self.joined and bool(metrics.WRONG.exceeded(self.error[None])[0])
 
     @property
     def off(self) -> float:
@@ -190,39 +182,29 @@ def _ten_lines(found: Sequence[Measured]) -> list[str]:
 def _draw_overlap(found: Sequence[Measured], png: Path) -> None:
     """Draws one pair of sessions, joined if there is one, and the Energy Metric of all."""
     one = next((each for each in found if each.shown["joined"]), found[0])
-    draw_panels(
-        png,
-        "Two sessions of one maze, merged",
-        f"Joined rightly: {count(~column(found, 'not_joined'))}.",
-        ("Energy Metric, m² + rad²", ""),
-        dots={"merged": column(found, "em_union"), "one session": column(found, "em_alone")},
-        paths=one.shown["paths"],
-    )
+    line = f"Joined rightly: {count(~column(found, 'not_joined'))}."
+    title, names = "Two sessions of one maze, merged", ("Energy Metric, m² + rad²", "")
+    dots = {"merged": column(found, "em_union"), "one session": column(found, "em_alone")}
+    draw_panels(png, title, line, names, dots=dots, paths=one.shown["paths"])
 
 
 def _draw_different(found: Sequence[Measured], png: Path) -> None:
     """Draws the shares of pairs that were joined."""
     different, same = column(found, "mazes_joined"), ~column(found, "maze_not_joined")
-    draw_panels(
-        png,
-        "Sessions of two mazes",
-        f"Joined: {count(different)} of two mazes, {count(same)} of one.",
-        ("pairs that were joined, %", ""),
-        dots={"two mazes": [100 * different.mean()], "one maze": [100 * same.mean()]},
-    )
+    line = f"Joined: {count(different)} of two mazes, {count(same)} of one."
+    dots = {"two mazes": [100 * different.mean()], "one maze": [100 * same.mean()]}
+    draw_panels(png, "Sessions of two mazes", line, ("pairs that were joined, %", ""), dots=dots)
 
 
 def _draw_ten(found: Sequence[Measured], png: Path) -> None:
     """Draws keyframes and Energy Metric over the sessions."""
     growth, frames = (spread(column(found, name)) for name in ("em_growth", "frames_growth"))
-    draw_panels(
-        png,
-        "Ten sessions of one maze, merged one by one",
-        f"After ten, over one, median (worst): EM {growth}, keyframes {frames}.",
-        ("over that of one session", "sessions merged"),
-        curves={"Energy Metric": column(found, "union"), "keyframes": column(found, "frames")},
-        limits={"goal, Energy Metric": GROWTH, "goal, keyframes": FRAMES},
-    )
+    title = "Ten sessions of one maze, merged one by one"
+    line = f"After ten, over one, median (worst): EM {growth}, keyframes {frames}."
+    names = "over that of one session", "sessions merged"
+    curves = {"Energy Metric": column(found, "union"), "keyframes": column(found, "frames")}
+    limits = {"goal, Energy Metric": GROWTH, "goal, keyframes": FRAMES}
+    draw_panels(png, title, line, names, curves=curves, limits=limits)
 
 
 def _merge(task: MapTask, *maps: StoredMap) -> MapArrays:
@@ -279,17 +261,17 @@ def _measure_halves(task: MapTask) -> Measured:
     label[given] = label[random.permutation(given)]
     log = replace(log, digest=f"{log.digest}+shuffled", views=views, label=label)
     mixed = task.methods.localise(first, scenarios.Recorded(recorded.config, log))
-    again, at = steps.revisited(truth, BUILDING), localised.found
+    again, at = steps.revisited(truth, metrics.BUILDING), localised.found
 
     def shares(found: np.ndarray, pose: np.ndarray) -> tuple[float, float]:
-        off = BUILDING.exceeded(pose_errors(steps.align(pose), truth))
+        off = metrics.BUILDING.exceeded(metrics.pose_errors(steps.align(pose), truth))
         return float(found[again].mean()), float(off[found].mean()) if found.any() else 0.0
 
     said = steps.align(localised.pose)
     found, off = shares(at, localised.pose)
     shuffled_found, shuffled_off = shares(mixed.found, mixed.pose)
-    nearby = steps.errors(localised.pose, truth, BUILDING.distance)
-    nearest = steps.nearest(truth, BUILDING.distance)
+    nearby = steps.errors(localised.pose, truth, metrics.BUILDING.distance)
+    nearest = steps.nearest(truth, metrics.BUILDING.distance)
     perfect = compose(steps.pose[nearest], between(steps.truth[nearest], truth))
     # Odometry from the first step with a true pose on.
     known = np.isfinite(truth).all(axis=1)
@@ -302,8 +284,8 @@ def _measure_halves(task: MapTask) -> Measured:
         "found": found,
         "off": off,
         "off_by_map": shares(at, perfect)[1],
-        "off_nearby": float(BUILDING.exceeded(nearby)[at].mean()) if at.any() else 0.0,
-        "off_by_odometry": float(BUILDING.exceeded(pose_errors(path, true)).mean()),
+        "off_nearby": float(metrics.BUILDING.exceeded(nearby)[at].mean()) if at.any() else 0.0,
+        "off_by_odometry": float(metrics.BUILDING.exceeded(metrics.pose_errors(path, true)).mean()),
         "shuffled_found": shuffled_found,
         "shuffled_off": shuffled_off,
     }
@@ -312,7 +294,7 @@ def _measure_halves(task: MapTask) -> Measured:
         "second, true": truth[:, :2],
         "second, found": np.where(at[:, None], said[:, :2], np.nan),
     }
-    error = np.where(at, pose_errors(said, truth)[:, 0], np.nan)
+    error = np.where(at, metrics.pose_errors(said, truth)[:, 0], np.nan)
     return Measured(figures, {"name": name, "revisited": int(again.sum()), "paths": paths, "error": error})
 
 
@@ -339,17 +321,13 @@ def _draw_halves(found: Sequence[Measured], png: Path) -> None:
     most = max(found, key=lambda each: each.record["found"]).shown
     errors = {shown["name"]: shown["error"] for _, shown in found}
     revisits, off = (" and ".join(f"{each.record[name]:.1%}" for each in found) for name in ("found", "off"))
-    draw_panels(
-        png,
-        "Buildings, each recording in two halves",
-        f"Found at {revisits} of the revisits; off by 2 m or 30 degrees at {off} of the found steps.",
-        ("error while found, m", "time in the second half, %"),
-        curves={
-            name: [error[np.linspace(0, len(error) - 1, 100).astype(int)]] for name, error in errors.items()
-        },
-        limits={"wrong": BUILDING.distance},
-        paths=PathPanel(f"{most['name']}: the second half in the map of the first", None, most["paths"]),
-    )
+    title = "Buildings, each recording in two halves"
+    line = f"Found at {revisits} of the revisits; off by 2 m or 30 degrees at {off} of the found steps."
+    names = "error while found, m", "time in the second half, %"
+    limits = {"wrong": metrics.BUILDING.distance}
+    curves = {name: [each[np.linspace(0, len(each) - 1, 100).astype(int)]] for name, each in errors.items()}
+    paths = PathPanel(f"{most['name']}: the second half in the map of the first", None, most["paths"])
+    draw_panels(png, title, line, names, curves=curves, limits=limits, paths=paths)
 
 
 HALVES = Figure("Buildings in two halves", _measure_halves, _halves_lines, _draw_halves, RECORDINGS)

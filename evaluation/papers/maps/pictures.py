@@ -150,8 +150,7 @@ def _draw_paths(axes: style.Axes, panel: PathPanel) -> None:
             mark, options = MARKS[label]
             axes.plot(*places.T, mark, label=label, **options)
     axes.set_title(panel.title, fontsize=9.5, color=style.INK, loc="left")
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
     axes.legend(
         loc="upper left", bbox_to_anchor=(0, -0.01), ncol=3, frameon=False, fontsize=8.5, labelcolor=style.INK
     )

@@ -13,11 +13,10 @@ from typing import Any, NamedTuple
 import networkx
 import numpy as np
 
-from evaluation.papers.tables.touch_table import KIDNAPS, MAIN
-from evaluation.papers.trial_sessions import collect_session
-from ratslam.runs.build_session import open_observations
+from evaluation.papers.tables.touch_table import KIDNAPS, MAIN, touch_config
+from evaluation.papers.trial_sessions import collect_recording, collect_session
 from ratslam.runs.settings.run_config import RunConfig
-from robot.sources.in_memory import InMemorySource, cut_log, load_into_memory
+from robot.sources.in_memory import InMemorySource, cut_log
 from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre, exploration_route
 from robot.world.scene import PAPER_CIRCUITS, MazeConfig, PathConfig, make_maze
 from tactile.base.errors import InputError
@@ -63,25 +62,9 @@ def record(recipe: Recipe) -> Recorded:
     Raises:
         InputError: the source cannot be read or simulated, or has no true poses.
     """
-    if recipe.config.simulation is not None:
-        config, log = collect_session(recipe.config)
-    else:
-        with open_observations(recipe.config) as (config, source):
-            log = load_into_memory(source)
-        if log.truth is None:
-            raise InputError(log.name, "no true poses", "a recording with truth")
+    collect = collect_recording if recipe.config.simulation is None else collect_session
+    config, log = collect(recipe.config)
     return Recorded(config, cut_log(log, recipe.first, recipe.last))
-
-
-def touch_config(maze: int, seed: int, settings: dict[str, Any], keyframes: dict[str, Any]) -> RunConfig:
-    """The configuration of a whisker session.
-
-    Args:
-        maze: seed of the maze. seed: of everything else. settings: further ones of `simulation`; those of
-            `maze` are added to its seed. keyframes: settings of the map.
-    """
-    parts = settings | {"seed": seed, "maze": {"seed": maze} | settings.get("maze", {})}
-    return RunConfig.model_validate({"simulation": parts, "keyframes": keyframes, "backend": "recall"})
 
 
 LOCALISED = 120
@@ -205,7 +188,7 @@ def open_world(maze: int) -> tuple[Maze, list[Cell]]:
 
 def ten_circuits(maze: int) -> Recipe:
     """The session that makes the map: that of the row `main` of the touch table."""
-    return Recipe(touch_config(maze, maze % 100, MAIN, {}))
+    return Recipe(touch_config(maze, maze % 100, MAIN))
 
 
 def unknown_start(maze: int, whisks: int = LOCALISED, name: str = "start") -> Recipe:
@@ -309,13 +292,13 @@ def closed_door(maze: int) -> tuple[Recipe, np.ndarray]:
 
 def kidnapped(maze: int) -> Recipe:
     """Ten circuits with eight kidnaps: the row `kidnaps` of the touch table."""
-    return Recipe(touch_config(maze, maze % 100, KIDNAPS, {"may_be_carried": True}))
+    return Recipe(touch_config(maze, maze % 100, KIDNAPS, keyframes={"may_be_carried": True}))
 
 
 def _later(maze: int, name: str, settings: dict[str, Any]) -> RunConfig:
     """The configuration of a further session of the maze; those of different names are independent."""
     seed = int(stream(maze, f"atlas.{name}").integers(1 << 31))
-    return touch_config(maze, seed, MAIN | settings, {})
+    return touch_config(maze, seed, MAIN | settings)
 
 
 def _explore_all(seed: int, maze: Maze, name: str, cells: tuple[Cell, ...], steps: int) -> Recipe:

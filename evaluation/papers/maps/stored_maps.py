@@ -5,9 +5,7 @@ A map is that of a recipe, which holds all settings, and of the code that made i
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -23,6 +21,7 @@ from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap
 from ratslam.runs.saved_map import NAME, describe_readings, write_map
 from robot.touch_source import observation_of
+from tactile.base.files import hidden_folder
 
 STEPS = "steps.npz"
 """File beside a map that holds its `MapArrays`."""
@@ -106,18 +105,14 @@ def _write_map(recorded: Recorded, path: Path) -> None:
     """Maps a session into a new folder, which appears complete."""
     config, log = recorded
     path.parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(mkdtemp(dir=path.parent, prefix=".unfinished-"))
-    try:
+    with hidden_folder(path, path.parent, ".unfinished-") as folder:
         session = start_session(config, log)
         for _ in session.replay(observation_of(sample) for sample in log):
             pass
-        source = describe_readings(log)
-        write_map(folder / NAME, session, config, source, recording=log.digest)
-        arrays = MapArrays.of_session(session, recorded.truth)
-        np.savez(folder / STEPS, **arrays._asdict())
-        folder.rename(path)
-    except OSError:
-        if not path.exists():  # else another process was faster
-            raise
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        write_map(folder / NAME, session, config, describe_readings(log), recording=log.digest)
+        np.savez(folder / STEPS, **MapArrays.of_session(session, recorded.truth)._asdict())
+        try:
+            folder.rename(path)
+        except OSError:
+            if not path.exists():  # else another process was faster
+                raise

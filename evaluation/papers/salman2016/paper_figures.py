@@ -9,6 +9,7 @@ import numpy as np
 from evaluation.metrics.exm import ExperienceMetric, creation_rows
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, GREY, INK, LINE_GREY, PURPLE, VERMILLION, YELLOW
+from evaluation.studies.metrics import ViewDifferences
 
 _SERIES_COLORS = (GREY, BLUE, VERMILLION, GREEN, PURPLE, YELLOW)
 """Colours of the compared series, in this order."""
@@ -38,8 +39,7 @@ def draw_drift(
             axes.plot(*odometry[rows].T, "-", lw=1.2, color=VERMILLION, alpha=shade, label=label)
         axes.plot(*truth[0], "o", ms=9, mfc="none", mec=GREEN, mew=1.8, zorder=6, label="start")
         _map_axes(axes)
-    style.add_legend(figure, panels[0])
-    return figure
+    return style.add_legend(figure, panels[0])
 
 
 def draw_experiences(
@@ -75,8 +75,7 @@ def draw_experiences(
                       mew=0.9 if mark == "x" else 0, color=color, label=label)  # fmt: skip
         axes.axvline(base - 0.5, color=INK, lw=1.1, ls=_DOTS, label="end of the base set")
         style.name_axes(axes, "step", "experience")
-    style.add_legend(figure, panels[0], columns=3)
-    return figure
+    return style.add_legend(figure, panels[0], columns=3)
 
 
 def draw_measured(
@@ -117,8 +116,7 @@ def draw_measured(
             axes.set_ylim(bottom=0)
         axes.grid(False, axis="x")
     fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
-    style.add_legend(figure, fullest)
-    return figure
+    return style.add_legend(figure, fullest)
 
 
 def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> style.Figure:
@@ -134,8 +132,7 @@ def draw_directions(title: str, line: str, maps: Mapping[str, tuple[np.ndarray, 
             part = np.where(rows[:, None], position, np.nan)
             axes.plot(*part.T, "-", lw=1.0, alpha=0.7, color=color, label=label)
         _map_axes(axes)
-    style.add_legend(figure, panels[0])
-    return figure
+    return style.add_legend(figure, panels[0])
 
 
 def draw_curves(
@@ -153,41 +150,32 @@ def draw_curves(
                 axes.plot(x, y, "o-", ms=3, lw=0.9, alpha=0.7, color=color, label=None if number else name)
         axes.set(xlim=(-0.04, 1.04), ylim=(0, None))
         style.name_axes(axes, "ARCR, strict", "ARR")
-    style.add_legend(figure, panels[0])
-    return figure
+    return style.add_legend(figure, panels[0])
 
 
-def draw_tuning(
-    edge: np.ndarray,
-    same: np.ndarray,
-    other: np.ndarray,
-    auc: float,
-    threshold: np.ndarray,
-    correct: np.ndarray,
-    incorrect: np.ndarray,
-    winner: float | None,
-) -> style.Figure:
+def draw_tuning(views: ViewDifferences, scores: np.ndarray, winner: float | None) -> style.Figure:
     """Draws histograms of view differences at the same and at different places, and results by threshold.
 
     Args:
-        edge: [B + 1] edges of the histograms. same, other: [B] numbers of pairs. auc: of their separation.
-        threshold, correct, incorrect: [G] thresholds and re-localisations. winner: chosen threshold, if any.
+        scores: [3, G] thresholds, correct and incorrect re-localisations. winner: chosen threshold, if any.
     """
+    threshold, correct, incorrect = scores
     taken = "no threshold meets the target" if winner is None else f"threshold {winner:g}"
-    line = f"AUC {auc:.3f}  ·  {taken}"
+    line = f"AUC {views.auc:.3f}  ·  {taken}"
     figure, (left, right) = _panels("Tuning of the classic matcher", line, ("", ""), 3.4)
-    for count, color, label in ((same, BLUE, "same place"), (other, VERMILLION, "different places")):
-        left.stairs(count / max(count.sum(), 1), edge, color=color, fill=True, alpha=0.45, label=label)
+    pairs = (views.same, BLUE, "same place"), (views.other, VERMILLION, "different places")
+    for count, color, label in pairs:
+        share = count / max(count.sum(), 1)
+        left.stairs(share, views.edge, color=color, fill=True, alpha=0.45, label=label)
     style.name_axes(left, "difference of two views", "share of pairs")
     right.plot(threshold, correct, "o-", ms=3, lw=1.0, color=GREEN, label="correct")
     right.plot(threshold, incorrect, "x-", ms=4, lw=1.0, color=PURPLE, label="incorrect")
     style.name_axes(right, "threshold", "re-localisations")
-    for axes in (left, right):
-        if winner is not None:
+    if winner is not None:
+        for axes in (left, right):
             axes.axvline(winner, color=INK, lw=1.1, ls=_DOTS, label="chosen")
     right.legend(frameon=False, fontsize=9, labelcolor=INK)
-    style.add_legend(figure, left)
-    return figure
+    return style.add_legend(figure, left)
 
 
 def _panels(

@@ -16,31 +16,10 @@ from evaluation.metrics.energy_metric import energy, energy_all_pairs, successiv
 from evaluation.metrics.exm import experience_metric
 from evaluation.metrics.statistics import bootstrap
 from evaluation.metrics.trajectory import align
-from evaluation.papers.paper_sets import (
-    Paper,
-    ResultRow,
-    column,
-    count_sets,
-    run_with_progress,
-    sweep_thresholds,
-)
-from evaluation.papers.salman2016 import paper_figures
-from evaluation.papers.salman2016.protocols import (
-    BY_MAZE,
-    COMMON,
-    DIRECTION_METRICS,
-    LATER_MAZE_START,
-    METHODS,
-    PROTOCOLS,
-    SWEPT,
-    THRESHOLDS,
-    Claim,
-    Condition,
-    Protocol,
-    clockwise_steps,
-    direction_metrics,
-    lap_of_step,
-)
+from evaluation.papers import paper_sets
+from evaluation.papers.paper_sets import Paper, ResultRow, column, run_with_progress
+from evaluation.papers.salman2016 import paper_figures, protocols
+from evaluation.papers.salman2016.protocols import BY_MAZE, THRESHOLDS, Claim, Condition, Protocol
 from evaluation.papers.trial_sessions import Control, apply_control, collect_session, run_session
 from evaluation.plots import style
 from evaluation.studies.metrics import (
@@ -57,7 +36,8 @@ from tactile.base.random_streams import stream
 from tactile.base.se2 import compose
 
 KEY = ("condition", "method", "control")
-FIELDS = (*TouchMetrics._fields, *BY_MAZE[2:], "em_ratio", *DIRECTION_METRICS, "across_share", "threshold")
+_ADDED = (*BY_MAZE[2:], "em_ratio", *protocols.DIRECTION_METRICS, "across_share", "threshold")
+FIELDS = (*TouchMetrics._fields, *_ADDED)
 """Columns of metrics in NAME.csv."""
 
 Rows = Sequence[ResultRow]
@@ -179,7 +159,7 @@ def _render_mazes(protocol: Protocol, rows: Rows) -> list[str]:
 def _series(protocol: Protocol, rows: Sequence[ResultRow]) -> list[tuple[str, str]]:
     """Pairs of method and control with rows: first without controls, then the controls of the protocol."""
     there = {row.key[1:] for row in rows}
-    methods = [method for method in METHODS if any(row.key[1] == method for row in rows)]
+    methods = [method for method in protocols.METHODS if any(row.key[1] == method for row in rows)]
     controls = [(m, c) for c in ("shuffled", "blank") for m in methods if (m, c) in there]
     return [(method, "none") for method in methods] + (controls if protocol.controls else [])
 
@@ -204,14 +184,14 @@ def _short(value: float, digits: int = 3) -> str:
 def _draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figure:
     """The figure of a reproduction: metrics over all sets, or sessions of the first set."""
     title, first_only = f"{name}: {protocol.title}", name in ("fig2", "fig3", "fig5")
-    line = f"{protocol.source}  ·  {count_sets(rows, first_only)}"
+    line = f"{protocol.source}  ·  {paper_sets.count_sets(rows, first_only)}"
     first = [row for row in rows if row.session is not None]
     if name == "fig2":
         paths: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
         for row in first:
             laps, result = row.session
             odometry = compose(result.truth[0], result.odometry)
-            lap = lap_of_step(result.truth, len(laps))
+            lap = protocols.lap_of_step(result.truth, len(laps))
             paths.setdefault(row.key[0], (result.truth[:, :2], odometry[:, :2], lap))
         return paper_figures.draw_drift(title, line, paths)
     if name == "fig3":
@@ -223,7 +203,7 @@ def _draw_reproduction(name: str, protocol: Protocol, rows: Rows) -> style.Figur
         for row in sorted(first, key=lambda row: row.key[1]):
             laps, result = row.session
             position = compose(align(result.trajectory, result.truth), result.trajectory)[:, :2]
-            maps[f"{row.key[0]}, {row.key[1]}"] = position, clockwise_steps(result.truth, laps)
+            maps[f"{row.key[0]}, {row.key[1]}"] = position, protocols.clockwise_steps(result.truth, laps)
         return paper_figures.draw_directions(title, line, maps)
     return (_curves if protocol.swept else _dots)(title, line, protocol, rows)
 
@@ -301,7 +281,7 @@ def session_config(
     condition: Condition, method: str, seed: int, assignments: Sequence[str] = ()
 ) -> RunConfig:
     """The configuration of a condition's session with a method."""
-    settings = [f"simulation.seed={seed}", *COMMON, *METHODS[method]]
+    settings = [f"simulation.seed={seed}", *protocols.COMMON, *protocols.METHODS[method]]
     if method != "ours":
         (views,) = (views for views in THRESHOLDS if f"touch.image.transform={views}" in condition.settings)
         settings.append(f"templates.threshold={THRESHOLDS[views]}")
@@ -343,7 +323,7 @@ def _run_job(job: _TrialJob) -> ResultRow:
     metrics = touch_metrics(result, job.config.score.experience_metric)
     ratio = metrics.em / metrics.em_odometry if metrics.em_odometry else np.nan
     values = {**metrics._asdict(), **parts_of_em(result), "em_ratio": ratio}
-    values |= direction_metrics(result, job.laps, LATER_MAZE_START)
+    values |= protocols.direction_metrics(result, job.laps, protocols.LATER_MAZE_START)
     drawn = (job.laps, result) if job.number == 0 and job.key[2] == "none" else None
     return ResultRow(job.key, job.number, job.seed, values, drawn)
 
@@ -362,22 +342,17 @@ def _sweep_job(job: _TrialJob) -> list[ResultRow]:
     """The Experience Metric of the classic method at the thresholds `SWEPT`, without maps."""
     config, log = collect_session(job.config)
     rows = []
-    places = sweep_thresholds(config, log, np.array(SWEPT))[0].place
-    for threshold, place in zip(SWEPT, places, strict=True):
+    places = paper_sets.sweep_thresholds(config, log, np.array(protocols.SWEPT))[0].place
+    for threshold, place in zip(protocols.SWEPT, places, strict=True):
         metric = experience_metric(place, np.asarray(log.truth), config.score.experience_metric)
-        values = {
-            "threshold": threshold,
-            "arr": metric.arr,
-            "arcr": metric.arcr,
-            "arcr_chain_free": metric.arcr_chain_free,
-            "relocalisations": metric.relocalisations,
-        }
+        names = "arr", "arcr", "arcr_chain_free", "relocalisations"
+        values = {"threshold": threshold} | {name: getattr(metric, name) for name in names}
         rows.append(ResultRow((*job.key[:2], "sweep"), job.number, job.seed, values))
     return rows
 
 
 def _run_figure(name: str, jobs: Sequence[_TrialJob], workers: int) -> Iterator[list[ResultRow]]:
-    if PROTOCOLS[name].swept:
+    if protocols.PROTOCOLS[name].swept:
         yield from _run_sweeps(name, jobs, workers)
         return
     unchanged = 0.0  # closures across the change of mazes in the set's session without one
@@ -407,4 +382,4 @@ def _run_sweeps(name: str, jobs: Sequence[_TrialJob], workers: int) -> Iterator[
         yield [row._replace(values={**row.values, "threshold": job.config.templates.threshold})]
 
 
-PAPER = Paper(PROTOCOLS, KEY, FIELDS, plan_jobs, _run_figure, _draw_reproduction, render_claims)
+PAPER = Paper(protocols.PROTOCOLS, KEY, FIELDS, plan_jobs, _run_figure, _draw_reproduction, render_claims)

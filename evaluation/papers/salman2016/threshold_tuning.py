@@ -80,9 +80,9 @@ def tune_threshold(
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
         plot, table = output / "threshold.png", output / "threshold.csv"
-        threshold, _, correct, incorrect = (np.array(column) for column in zip(*scores, strict=True))
         chosen = None if winner is None else winner.threshold
-        draw_tuning(*views, threshold, correct, incorrect, chosen).savefig(plot)
+        counts = np.array([(one.threshold, one.correct, one.incorrect) for one in scores]).T
+        draw_tuning(views, counts, chosen).savefig(plot)
         lines = [",".join(ThresholdScore._fields), *(",".join(map(repr, each)) for each in scores)]
         table.write_text("\n".join(lines) + "\n", encoding="utf-8")
         yield f"\nwrote {plot} and {table}"

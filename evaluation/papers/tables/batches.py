@@ -21,6 +21,7 @@ from jax import lax
 from evaluation.papers.tables.cycles import SESSIONS
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.speed import MOTION, interleaved_medians, replay_network
+from evaluation.papers.trial_sessions import collect_session
 from evaluation.studies.network_batch import BLOCK, tuned_levels
 from ratslam.classic import pose_cells
 from ratslam.classic.config import NetworkConfig, rings, units
@@ -30,9 +31,8 @@ from ratslam.core.compilation import prepare_precision
 from ratslam.core.session import CHUNK, Session, run_chunk
 from ratslam.methods.recall import RecallBackend, RecallState
 from ratslam.recall.memory import MapFeedback, MergedRows
-from ratslam.runs.build_session import build_session, open_observations
+from ratslam.runs.build_session import build_session
 from ratslam.runs.settings.run_config import load_config
-from robot.sources.in_memory import load_into_memory
 from robot.touch_source import observation_of
 from tactile.base.types import Array, Observation, Odometry
 
@@ -101,8 +101,7 @@ def _record_circuits(steps: int) -> tuple[RecallBackend, list[Recording]]:
     recordings: list[Recording] = []
     for seed in count():
         config = load_config(SESSIONS["circuits"], [f"simulation.seed={seed}"])
-        with open_observations(config) as (config, source):
-            log = load_into_memory(source)
+        config, log = collect_session(config)
         observations = [observation_of(sample) for sample in log][:steps]
         made = build_session(config, log)
         if not seed:

@@ -23,8 +23,9 @@ from evaluation.metrics.statistics import expected_calibration_error
 from evaluation.papers.tables.comparison import Compared, Files, SessionLog, compare_runs
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
 from evaluation.papers.tables.recordings import GOLDEN, Recording, metres, real_recordings
-from evaluation.papers.trial_sessions import ClosureClaims, closure_claims, run_recording
+from evaluation.papers.trial_sessions import ClosureClaims, closure_claims, known_ate, run_recording
 from evaluation.studies.executor import run_tasks
+from evaluation.studies.metrics import closure_errors
 from evaluation.studies.perturbation import Perturbation, miscalibrate, perturb, spoil_labels
 from ratslam.runs.settings.run_config import RunConfig
 
@@ -163,8 +164,7 @@ def buildings_table(
                 "sequences": len(accepted),
                 "false_sequences": int(accepted.sum()),
             }
-            errors = {"odometry": figures.odometry, "final": figures.final, "live": figures.live}
-            log.add(name, seed, errors | counts_of)
+            log.add(name, seed, dict(zip(RunFigures._fields[:3], figures, strict=False)) | counts_of)
             runs.append(figures)
         yield markdown_row([row.recording.label, *_cells(runs)])
         found.setdefault(row.section, []).extend(runs)
@@ -189,17 +189,11 @@ def _measure_run(task: tuple[RunConfig, str, int]) -> RunFigures:
         InputError: the recording cannot be used, or has no truth.
     """
     config, copies, seed = task
-    run = run_recording(config, _PERTURBATIONS[copies] if seed else None, seed)
-    claims = closure_claims(run)
+    _, session, run = run_recording(config, _PERTURBATIONS[copies] if seed else None, seed)
+    claims = closure_claims(session.map, run.truth)
     false, sequences, odds = judge_claims(claims)
-    return RunFigures(
-        odometry=run.ate(run.odometry),
-        final=run.ate(run.final),
-        live=run.ate(run.online),
-        closures=false[claims.accepted],
-        sequences=sequences,
-        odds=odds,
-    )
+    odometry, final, live = (known_ate(path, run.truth) for path in (run.odometry, run.trajectory, run.live))
+    return RunFigures(odometry, final, live, false[claims.accepted], sequences, odds)
 
 
 def judge_claims(claims: ClosureClaims) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -339,8 +333,7 @@ def _measure_recording(task: tuple[RunConfig, int]) -> tuple[float, float, int, 
         InputError: the recording cannot be used, or has no truth.
     """
     config, seed = task
-    run = run_recording(config, perturb if seed else None, seed)
-    closures = run.session.map.closures()
-    apart = np.hypot(*(run.truth[closures[:, 0]] - run.truth[closures[:, 1]])[:, :2].T)
-    false = int((apart > 2.5 * run.config.pose_cells.cell_size).sum())
-    return run.ate(run.final), run.ate(run.odometry), len(closures), false
+    config, _, run = run_recording(config, perturb if seed else None, seed)
+    false = int((closure_errors(run.truth, run.closures) > 2.5 * config.pose_cells.cell_size).sum())
+    final, odometry = (known_ate(poses, run.truth) for poses in (run.trajectory, run.odometry))
+    return final, odometry, len(run.closures), false

@@ -22,14 +22,11 @@ from scipy.special import expit
 from evaluation.metrics.statistics import auc
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.touch_table import CHANGE, TouchTask, task_config
-from evaluation.papers.trial_sessions import run_session, start_session
+from evaluation.papers.trial_sessions import collect_session, run_session, start_session
 from evaluation.studies.executor import run_tasks
 from ratslam.mapping.closure_judge import BEYOND, KINDS, WEIGHTS, SequenceEvidence, sequence_evidence
-from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.loop_closures import ClosureLog, Verdict
+from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.map import KeyframeMap
-from ratslam.runs.build_session import open_observations
-from robot.sources.in_memory import load_into_memory
 from tactile.base.se2 import between, wrap
 
 ROWS = (
@@ -80,10 +77,9 @@ def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = No
 
 def _judge_session(task: TouchTask) -> JudgedSession:
     """Runs a session and judges the sequences of its final map."""
-    with open_observations(task_config(task)) as (config, source):
-        log = load_into_memory(source)
+    config, log = collect_session(task_config(task))
     session = start_session(config, log)
-    truth, map = run_session(config, log, lambda *_: session).truth, session.map
+    truth, map = run_session(config, log, session).truth, session.map
     assert isinstance(map, KeyframeMap)
     final, graph, steps = map.solution(), map.keyframes(), map.keyframe_steps()
     scores = final.log.scores()
@@ -94,7 +90,14 @@ def _judge_session(task: TouchTask) -> JudgedSession:
         sequence_evidence(graph, final.fit, final.log, final.cut, chosen, after)
         for after in (BEYOND, YOUNG, 0)
     )
-    true = _are_true(graph, final.log, truth[steps], later, chosen)
+    # At least half of the candidates of a true sequence agree with the truth, to 3.6 cells and 30 degrees.
+    table, poses = final.log.table(), truth[steps]
+    frame, match = table[:, 0].astype(int), table[:, 1].astype(int)
+    error = between(poses[match], poses[frame])
+    turned = np.abs(wrap(error[:, 2] + table[:, 2] * graph.sector_angle))
+    right = (np.hypot(error[:, 0], error[:, 1]) < 3.6 * graph.cell) & (turned < np.radians(30))
+    right &= later[frame] == later[match]  # the later keyframes may be of another world
+    true = np.array([right[table[:, 5] == sequence].mean() >= 0.5 for sequence in chosen.tolist()], bool)
     return true, scores[chosen], final.log.verdicts()[chosen] == Verdict.ACCEPTED, tuple(known)
 
 
@@ -104,12 +107,12 @@ def fit_weights(sessions: Sequence[JudgedSession]) -> np.ndarray:
     features = np.concatenate([evidence.features() for evidence, _ in versions])
     true = np.concatenate([true for _, true in versions]).astype(float)
     known = np.isfinite(features).all(axis=(1, 2))
-    once = 1 / 3  # a sequence counts once, however often it is judged
-    return np.stack([_regress(features[known, way], true[known], once) for way in (0, 1)])
+    return np.stack([_regress(features[known, way], true[known]) for way in (0, 1)])
 
 
-def _regress(features: np.ndarray, true: np.ndarray, worth: float) -> np.ndarray:
+def _regress(features: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Weights of features [n, F], the first of which is 1, by which they tell what is true [n]."""
+    worth = 1 / 3  # a sequence counts once, however often it is judged
     ridge = RIDGE * (np.arange(features.shape[1]) > 0)
 
     def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
@@ -121,24 +124,6 @@ def _regress(features: np.ndarray, true: np.ndarray, worth: float) -> np.ndarray
     against[[0, 1, KINDS, KINDS + 1]] = True
     bounds = [(None, None), (0, None), (0, None), *((None, 0 if one else None) for one in against)]
     return cast(np.ndarray, minimize(loss, np.zeros(features.shape[1]), jac=True, bounds=bounds).x)
-
-
-def _are_true(
-    graph: KeyframeGraph, log: ClosureLog, truth: np.ndarray, later: np.ndarray, sequences: np.ndarray
-) -> np.ndarray:
-    """[n] bool of sequences [n]: at least half of their candidates agree with the true poses [N, 3], to 3.6
-    cells and 30 degrees.
-
-    Args:
-        later: [N] bool, keyframes of another world than the earlier ones.
-    """
-    table = log.table()
-    frame, match = table[:, 0].astype(int), table[:, 1].astype(int)
-    error = between(truth[match], truth[frame])
-    turned = np.abs(wrap(error[:, 2] + table[:, 2] * graph.sector_angle))
-    right = (np.hypot(error[:, 0], error[:, 1]) < 3.6 * graph.cell) & (turned < np.radians(30))
-    right &= later[frame] == later[match]
-    return np.array([right[table[:, 5] == sequence].mean() >= 0.5 for sequence in sequences.tolist()], bool)
 
 
 def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[np.ndarray]) -> str:

@@ -304,7 +304,7 @@ def _compared_cells(what: Compared, pairs: _Pairs) -> dict[str, str]:
     medians, counts = dict[str, str](), dict[str, str]()
     for title, name in what.medians.items():
         old, new = pairs.known(name)
-        medians[title] = f"{_median(old)}, {_median(new)}{_of(len(old), pairs)}"
+        medians[title] = _medians(old, new, pairs)
     for title, names in what.counts.items():
         sides = pairs.known(*names)
         sums = [f"{side[0].sum():.0f} / {side[1].sum():.0f}" for side in sides]
@@ -313,9 +313,7 @@ def _compared_cells(what: Compared, pairs: _Pairs) -> dict[str, str]:
         "sessions": str(len(pairs.keys)),
         f"{what.label}, now / before [95 %]": _ratio(pairs, what.error),
         f"live {what.label.split()[-1]}, now / before [95 %]": _ratio(pairs, what.live),
-        f"{what.label} / odometry, median": (
-            f"{_median(over[0])}, {_median(over[1])}{_of(len(over[0]), pairs)}"
-        ),
+        f"{what.label} / odometry, median": _medians(over[0], over[1], pairs),
         "worse than odometry": _count(what.worse, pairs, what.error, what.odometry),
         "live worse than odometry": _count(what.worse, pairs, what.live, what.odometry),
         **medians,
@@ -357,6 +355,10 @@ def _changed(old: np.ndarray, new: np.ndarray) -> str:
 
 def _median(values: np.ndarray) -> str:
     return f"{np.median(values):.3f}" if len(values) else "-"
+
+
+def _medians(old: np.ndarray, new: np.ndarray, pairs: _Pairs) -> str:
+    return f"{_median(old)}, {_median(new)}{_of(len(old), pairs)}"
 
 
 def _of(count: int, pairs: _Pairs) -> str:

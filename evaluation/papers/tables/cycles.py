@@ -14,9 +14,9 @@ import pstats
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
-from contextlib import contextmanager
 from itertools import product
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 
@@ -125,7 +125,7 @@ def profile_table(sessions: Sequence[str] | None = None) -> Iterator[str]:
     cycles = _open_cycles(sessions, ("float64",))
     columns = []
     for cycle in cycles:
-        with _selecting_inline():
+        with patch.object(selection_worker, "THREAD", _Inline()), patch.object(archive, "THREAD", _Inline()):
             total = min(cycle.time() for _ in range(3))
             parts = _profile(cycle)
         columns.append({part: us * total / sum(parts.values()) for part, us in parts.items()})
@@ -183,21 +183,9 @@ def own_times(stats: dict[Any, Any]) -> dict[Any, float]:
     return times
 
 
-@contextmanager
-def _selecting_inline() -> Iterator[None]:
-    """Lets selections run where they begin."""
-    modules: tuple[Any, ...] = selection_worker, archive
-    threads = [each.THREAD for each in modules]
-    for each in modules:
-        each.THREAD = _Inline()
-    try:
-        yield
-    finally:
-        for each, thread in zip(modules, threads, strict=True):
-            each.THREAD = thread
-
-
 class _Inline(Executor):
+    """Work runs where it begins."""
+
     def submit(self, work: Callable[..., Any], /, *values: Any, **named: Any) -> Future[Any]:
         done: Future[Any] = Future()
         done.set_result(work(*values, **named))

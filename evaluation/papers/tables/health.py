@@ -19,19 +19,18 @@ from scipy.special import expit
 
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.statistics import auc
-from evaluation.metrics.trajectory import ate
 from evaluation.papers.tables.buildings import HARM_FACTOR, HARM_MARGIN
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.tables.recordings import Recording, real_recordings
+from evaluation.papers.tables.recordings import real_recordings
 from evaluation.papers.tables.spoilt_maps import spoilt_maps
-from evaluation.papers.tables.touch_table import MAIN, NOISE, ROWS
-from evaluation.papers.trial_sessions import run_recording
+from evaluation.papers.tables.touch_table import MAIN, NOISE, ROWS, touch_config
+from evaluation.papers.trial_sessions import known_ate, run_recording
 from evaluation.studies.executor import run_tasks
 from evaluation.studies.perturbation import miscalibrate
 from ratslam.mapping.closure_selection import ACCEPTED_WEIGHT
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import DOUBTED, INTERCEPT, WEIGHTS, health_features
-from ratslam.runs.settings.run_config import RunConfig
+from ratslam.runs.settings.run_config import RunConfig, load_config
 
 FIRST_MAZE = 31000
 RIDGE = 2.0
@@ -93,16 +92,14 @@ def _judge_session(task: tuple[str, int]) -> np.ndarray:
     number = task[1]
     config, touch = task_config(*task)
     copied = number > 0 and not touch
-    run = run_recording(config, miscalibrate if copied else None, number)
-    map = run.session.map
+    _, session, run = run_recording(config, miscalibrate if copied else None, number)
+    map = session.map
     assert isinstance(map, KeyframeMap)
     truth, graph = run.truth[map.keyframe_steps()], map.keyframes()
     known = np.isfinite(truth).all(axis=1)
 
     def error(poses: np.ndarray) -> float:
-        if touch:
-            return energy_all_pairs(poses[known], truth[known]).total
-        return ate(poses[known], truth[known])
+        return energy_all_pairs(poses[known], truth[known]).total if touch else known_ate(poses, truth)
 
     before = error(graph.dead_reckoned())
     limit = HARM_FACTOR * before + (0.0 if touch else HARM_MARGIN)
@@ -118,15 +115,10 @@ def _judge_session(task: tuple[str, int]) -> np.ndarray:
 def task_config(row: str, number: int) -> tuple[RunConfig, bool]:
     """The configuration of a session, and whether it is a whisker session."""
     if row in TOUCH:
-        maze = FIRST_MAZE + number
-        simulation = TOUCH[row]
-        simulation = simulation | {"seed": number, "maze": {"seed": maze} | simulation.get("maze", {})}
-        parts = {"simulation": simulation, "session": {"reserve": 2048}}
-        return RunConfig.model_validate(parts), True
+        return touch_config(FIRST_MAZE + number, number, TOUCH[row], session={"reserve": 2048}), True
     config, file = REAL[row]
     settings = (f"recording.file={(real_recordings() or Path()).absolute() / file}",) if file else ()
-    recording = Recording(row, config, settings, real=True)
-    return recording.configuration("session.reserve=1024"), False
+    return load_config(config, [*settings, "session.reserve=1024"]), False
 
 
 def fit_weights(maps: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Rows of a Markdown table, printed one at a time, each as soon as it is measured."""
+"""Markdown tables: whole ones, and rows that are printed one at a time, each as soon as it is measured."""
 
 from __future__ import annotations
 
@@ -15,6 +15,14 @@ def markdown_row(cells: Iterable[object]) -> str:
 def markdown_header(columns: Sequence[str]) -> str:
     """The header and the rule below it."""
     return f"{markdown_row(columns)}\n{'|---' * len(columns)}|"
+
+
+def table_lines(
+    above: Sequence[str], columns: Sequence[str], rows: Iterable[Iterable[object]], below: Sequence[str] = ()
+) -> list[str]:
+    """The lines of a table, with sentences above and below it."""
+    table = [*markdown_header(columns).splitlines(), *map(markdown_row, rows)]
+    return [*above, *[""] * bool(above), *table, *[""] * bool(below), *below]
 
 
 def select_rows(

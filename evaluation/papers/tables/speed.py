@@ -45,9 +45,9 @@ def speed_table(sizes: Sequence[int] = SIZES, rounds: int = ROUNDS) -> Iterator[
         yield markdown_row([n, *times, f"{us['numpy'] / us['window']:.0f}"])
 
 
-def network_calls(n: int, steps: int = STEPS) -> dict[str, tuple[Callable[[], Any], int]]:
+def network_calls(n: int) -> dict[str, tuple[Callable[[], Any], int]]:
     """The calls to time for networks of n x n x 36 cells, compiled."""
-    few = max(5, 400 // n)
+    steps, few = STEPS, max(5, 400 // n)
     window, start = replay_network(n, "window", steps)
     single, start32 = replay_network(n, "window", steps, np.float32)
     dense, whole = replay_network(n, "dense", few)

@@ -86,25 +86,20 @@ def spoil(
     if choices:
         # 1 to 4 false sequences of 6 to 39 candidates.
         count, length = (int(random.integers(low, high + 1)) for low, high in ((1, 4), (6, 39)))
-        for _ in range(count):
-            _add_false_sequence(graph, log, truth, length, random, choices)
+        if graph.count - length > graph.guard + length + 5:
+            for _ in range(count):
+                _add_false_sequence(graph, log, truth, length, random, choices)
     return log
 
 
 def _add_false_sequence(
-    graph: KeyframeGraph,
-    log: ClosureLog,
-    truth: np.ndarray,
-    length: int,
-    random: np.random.Generator,
+    graph: KeyframeGraph, log: ClosureLog, truth: np.ndarray, length: int, random: np.random.Generator,
     choices: int,
-) -> None:
+) -> None:  # fmt: skip
     """Accepts the false sequence that looks most alike of at most `choices` pairs of stretches; none if
     there is none among `_ATTEMPTS` random pairs."""
     found: list[tuple[float, int, int]] = []
     first, reckoned = graph.guard + length + 5, graph.dead_reckoned()
-    if graph.count - length <= first:
-        return
     for _ in range(_ATTEMPTS):
         frame = int(random.integers(first, graph.count - length))
         match = int(random.integers(0, frame - graph.guard - length))

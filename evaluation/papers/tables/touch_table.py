@@ -20,7 +20,7 @@ from evaluation.metrics.run_metrics import energy_within_pieces, unjoined_share
 from evaluation.metrics.statistics import wilson_interval
 from evaluation.papers.tables.comparison import Compared, Files, SessionLog, compare_runs
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
-from evaluation.papers.trial_sessions import run_session
+from evaluation.papers.trial_sessions import run_session, start_session
 from evaluation.studies.executor import run_tasks
 from evaluation.studies.growth import with_new_ground
 from evaluation.studies.metrics import (
@@ -50,9 +50,12 @@ _RECOVERY_LIMIT = 45
 MAIN: dict[str, Any] = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}}}
 _ROUGH = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
 _MAX_ANGLE = {"image": {"transform": "max_angle"}}
-KIDNAPS = {"kidnaps": {"count": 8, "ahead": 45.0}}
-EXPLORATION = {"path": {"explore": 1500}}
+KIDNAPS, _KIDNAPS_24 = ({"kidnaps": {"count": count, "ahead": 45.0}} for count in (8, 24))
+_CARRIED = {"may_be_carried": True}
+EXPLORATION, _LONG = {"path": {"explore": 1500}}, MAIN | {"path": {"explore": 5000}}
+_OPEN_ARENA, _TREE = (MAIN | EXPLORATION | {"maze": maze} for maze in ({"share": 0.08}, {"kind": "tree"}))
 NOISE = OdometryConfig()
+_NOISE_X_2 = {"length": 2 * NOISE.length, "heading": 2 * NOISE.heading}
 _OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
@@ -86,30 +89,12 @@ ROWS = {
     "white": TouchRow("white odometry noise", {"odometry": {"noise": "white"}}, sessions=20),
     "telescoping": TouchRow("telescoping noise", {"odometry": {"noise": "telescoping"}}),
     "exploration": TouchRow("free exploration, 1500 whisks", EXPLORATION, sessions=40),
-    "open arena": TouchRow(
-        "open arena, 8 % of the walls, free exploration",
-        MAIN | EXPLORATION | {"maze": {"share": 0.08}},
-        sessions=20,
-    ),
-    "tree": TouchRow(
-        "maze without loops, free exploration", MAIN | EXPLORATION | {"maze": {"kind": "tree"}}, sessions=20
-    ),
-    "noise x 2": TouchRow(
-        "odometry noise x 2",
-        MAIN | {"odometry": {"length": 2 * NOISE.length, "heading": 2 * NOISE.heading}},
-        sessions=20,
-    ),
+    "open arena": TouchRow("open arena, 8 % of the walls, free exploration", _OPEN_ARENA, sessions=20),
+    "tree": TouchRow("maze without loops, free exploration", _TREE, sessions=20),
+    "noise x 2": TouchRow("odometry noise x 2", MAIN | {"odometry": _NOISE_X_2}, sessions=20),
     "exploration, 3000": TouchRow("free exploration, 3000 whisks", {"path": {"explore": 3000}}),
-    "exploration, 5000": TouchRow(
-        "free exploration, 5000 whisks", MAIN | {"path": {"explore": 5000}}, sessions=5
-    ),
-    "kidnaps, 5000": TouchRow(
-        "5000 whisks with 24 kidnaps",
-        MAIN | {"path": {"explore": 5000}, "kidnaps": {"count": 24, "ahead": 45.0}},
-        {},
-        {"may_be_carried": True},
-        sessions=5,
-    ),
+    "exploration, 5000": TouchRow("free exploration, 5000 whisks", _LONG, sessions=5),
+    "kidnaps, 5000": TouchRow("5000 whisks with 24 kidnaps", _LONG | _KIDNAPS_24, {}, _CARRIED, sessions=5),
     "new ground": TouchRow("3000 whisks that enter no cell twice", MAIN, sessions=5, new_ground=3000),
     "5 x 5": TouchRow("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
     "12 x 8": TouchRow("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
@@ -131,7 +116,7 @@ ROWS = {
         "main from raw samples with drift, colour and creep",
         MAIN | {"mechanics": {"baseline": HALL_BASELINE.model_dump()}},
     ),
-    "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, {"may_be_carried": True}),
+    "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, _CARRIED),
     "control: shuffled": TouchRow("control: shuffled images", MAIN),
     "control: no image": TouchRow("control: no images", MAIN),
     "control: other maze": TouchRow("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),
@@ -237,12 +222,12 @@ def _measure_session(task: TouchTask) -> SessionFigures:
 
 
 def run_and_measure(
-    task: TouchTask, start: Callable[[RunConfig, InMemorySource], Session] | None = None
+    task: TouchTask, start: Callable[[RunConfig, InMemorySource], Session] = start_session
 ) -> tuple[SessionResult, SessionFigures]:
     """Runs one session, and measures it.
 
     Args:
-        start: makes the session, see `run_session`.
+        start: makes the session from the completed configuration and its source.
     """
     with open_observations(task_config(task)) as (config, source):
         kidnaps = np.flatnonzero(source.source.kidnapped).tolist()  # type: ignore[attr-defined]
@@ -252,7 +237,7 @@ def run_and_measure(
         log = replace(log, views=log.views[order].copy())
     if task.row == "control: no image":
         log = replace(log, views=np.zeros_like(log.views))
-    result = run_session(config, log, start)
+    result = run_session(config, log, start(config, log))
     truth = result.truth
     true_closures = result.closures[closure_errors(result.truth, result.closures) <= FALSE_CLOSURE_DISTANCE]
     returned = experience_metric_if_defined(result) is not None  # else a quarter is the base set
@@ -262,29 +247,33 @@ def run_and_measure(
     change = int(CHANGE * log.length)
     across = (result.closures[:, 0] >= change) & (result.closures[:, 1] < change)
     later, earlier = true_closures.T
-    recovered = [min(later[(later >= k) & (earlier < k)] - k, default=log.length) for k in kidnaps]
-    return result, SessionFigures(
-        metrics._replace(
-            em_experiences=energy_all_pairs(snapped, truth).total,
-            arcr_chain_free=float(np.nan_to_num(metrics.arcr_chain_free)),
-        ),
-        revisits_closed=_share_of_revisits_closed(truth, true_closures),
-        em_live=energy_all_pairs(result.live, truth).total,
-        em_pieces=energy_within_pieces(result.trajectory, truth, result.piece).total,
-        unjoined=unjoined_share(result.piece),
-        across=int(across.sum()),
-        recovery=tuple(map(int, recovered)),
-    )
+    recovered = (min(later[(later >= k) & (earlier < k)] - k, default=log.length) for k in kidnaps)
+    em_experiences, em_live = (energy_all_pairs(path, truth).total for path in (snapped, result.live))
+    chain_free = float(np.nan_to_num(metrics.arcr_chain_free))
+    metrics = metrics._replace(em_experiences=em_experiences, arcr_chain_free=chain_free)
+    closed = _share_of_revisits_closed(truth, true_closures)
+    em_pieces = energy_within_pieces(result.trajectory, truth, result.piece).total
+    rest = unjoined_share(result.piece), int(across.sum()), tuple(map(int, recovered))
+    return result, SessionFigures(metrics, closed, em_live, em_pieces, *rest)
 
 
 def task_config(task: TouchTask) -> RunConfig:
     """The configuration of a session."""
     _, simulation, touch, keyframes, _, new_ground = ROWS[task.row]
-    maze = {"seed": task.maze} | simulation.get("maze", {})
-    simulation = simulation | {"seed": task.seed, "maze": maze}
-    parts = {"simulation": simulation, "touch": touch, "keyframes": keyframes, "backend": task.backend}
-    config = RunConfig.model_validate(parts)
+    parts = {"touch": touch, "keyframes": keyframes, "backend": task.backend}
+    config = touch_config(task.maze, task.seed, simulation, **parts)
     return with_new_ground(config, new_ground) if new_ground else config
+
+
+def touch_config(maze: int, seed: int, simulation: dict[str, Any], **parts: Any) -> RunConfig:
+    """The configuration of a whisker session.
+
+    Args:
+        maze: seed of the maze. seed: of everything else. simulation: further settings of `simulation`; those
+            of `maze` are added to its seed. parts: settings beside `simulation`.
+    """
+    simulation = simulation | {"seed": seed, "maze": {"seed": maze} | simulation.get("maze", {})}
+    return RunConfig.model_validate({"simulation": simulation, **parts})
 
 
 def _share_of_revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> float:

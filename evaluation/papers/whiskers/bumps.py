@@ -12,10 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.trajectory import align, ate
+from evaluation.metrics.trajectory import align
 from evaluation.papers.figure import Figure
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import require_recordings
+from evaluation.papers.trial_sessions import known_ate
 from evaluation.plots import style
 from ratslam.core.estimates import GridDrawing
 from ratslam.core.session import Session
@@ -124,26 +125,24 @@ def _measure(folder: Path) -> BumpsResult:
 
 def _table(result: BumpsResult) -> list[str]:
     """The lines of the table: odometry, then the variants of the filter."""
-    lines = markdown_header(("real Create, bumpers", "ATE, median (worst) m", "live", "worse than odometry"))
-    rows = lines.split("\n")
-    rows += [markdown_row([name, f"{value:.2f}", "", ""]) for name, value in result.odometry.items()]
+    rows = [[name, f"{value:.2f}", "", ""] for name, value in result.odometry.items()]
     for name, final in result.final.items():
         online = result.online[name]
         control = result.odometry[f"odometry, {OTHERS}" if name == OTHERS else "odometry"]
         cells = (f"{np.median(each):.2f} ({each.max():.2f})" for each in (final, online))
-        rows.append(markdown_row([name, *cells, f"{(final > control).sum()} of {len(final)}"]))
+        rows.append([name, *cells, f"{(final > control).sum()} of {len(final)}"])
     low, middle, high = np.percentile(result.distance, (10, 50, 90))
-    return [
-        *rows,
-        "",
+    below = (
         f"{len(result.distance)} contacts; the true distance to the nearest wall is {middle:.3f} m "
         f"({low:.3f} to {high:.3f}, 10-90 %); assumed are 0.17 m. Fits use the truth: bounds, not results. "
         f"In steps that begin in contact the robot advances by {result.advance[0]:.2f} of its odometry, "
         f"in others by {result.advance[1]:.2f}. `slip, no map` leaves out what the map says. The slip was "
         "found, and the correction by other Creates chosen, on this drive: neither is held out. "
         "Where bumps at random times reach the same median, the ATE of one drive does not "
-        "show that bumps help.",
-    ]
+        "show that bumps help."
+    )
+    columns = "real Create, bumpers", "ATE, median (worst) m", "live", "worse than odometry"
+    return table_lines([], columns, rows, [below])
 
 
 def _draw(result: BumpsResult, file: Path) -> None:
@@ -162,11 +161,9 @@ def _draw(result: BumpsResult, file: Path) -> None:
     )
     for x1, y1, x2, y2 in result.walls:
         axes.plot([x1, x2], [y1, y2], color=style.INK, lw=1.4, zorder=3)
-    for path, colour, name in (
-        (result.raw, style.GREEN, "odometry"),
-        (result.path, style.BLUE, "grid filter"),
-        (result.truth, style.VERMILLION, "truth"),
-    ):
+    paths = {"odometry": result.raw, "grid filter": result.path, "truth": result.truth}
+    colours = style.GREEN, style.BLUE, style.VERMILLION
+    for (name, path), colour in zip(paths.items(), colours, strict=True):
         axes.plot(*path[:, :2].T, color=colour, lw=1.1, label=name)
     axes.legend(frameon=False, fontsize=9, loc="upper left")
     axes.set(aspect="equal", xlim=(-4.4, 3.6), ylim=(-2.9, 2.9), facecolor="#cdcdcd")
@@ -193,7 +190,7 @@ def _run(
     online = np.array([step.pose for step in session.replay(observations)])
     path, grid = session.map.trajectory(), session.map.grid()
     assert grid is not None
-    return _ate(path, truth), _ate(online, truth), path, grid
+    return known_ate(path, truth), known_ate(online, truth), path, grid
 
 
 def _odometry_errors(observations: list[Observation], truth: np.ndarray) -> dict[str, float]:
@@ -204,7 +201,7 @@ def _odometry_errors(observations: list[Observation], truth: np.ndarray) -> dict
     def error(turn: float = 1.0, drift: float = 0.0, slip: float = 0.0) -> float:
         motion = moves[:, :3] * [1, 1, turn] + drift * moves[:, 3:] * [0, 0, 1]
         motion[pressed] *= [1 - slip, 1 - slip, 1 - slip / 2]
-        return _ate(integrate(motion), truth)
+        return known_ate(integrate(motion), truth)
 
     corrected, drifts = correct_observations(OTHER_CREATES, observations), np.arange(-0.5, 0.5, 0.02)
     return {
@@ -212,7 +209,7 @@ def _odometry_errors(observations: list[Observation], truth: np.ndarray) -> dict
         "odometry, turn scale fitted to the truth": min(error(turn=s) for s in np.arange(0.8, 1.3, 0.01)),
         "odometry, heading drift fitted to the truth": min(error(drift=d / 60) for d in drifts),
         "odometry without forward motion and half of the turn in pressed steps": error(slip=1.0),
-        f"odometry, {OTHERS}": _ate(_dead_reckoning(corrected), truth),
+        f"odometry, {OTHERS}": known_ate(_dead_reckoning(corrected), truth),
     }
 
 
@@ -228,10 +225,6 @@ def _dead_reckoning(observations: list[Observation]) -> np.ndarray:
 
 def _known(truth: np.ndarray) -> np.ndarray:
     return np.isfinite(truth).all(axis=1)
-
-
-def _ate(path: np.ndarray, truth: np.ndarray) -> float:
-    return ate(path[_known(truth)], truth[_known(truth)])
 
 
 def _aligned(path: np.ndarray, truth: np.ndarray) -> np.ndarray:

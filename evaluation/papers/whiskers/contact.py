@@ -16,22 +16,15 @@ from matplotlib.axes import Axes
 from scipy.ndimage import uniform_filter1d
 
 from evaluation.papers.figure import Figure
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import REACH, require_recordings
 from evaluation.papers.whiskers.drift import Decide, Snippet, fit_free_model, score_stream, simulate_stream
 from evaluation.plots import style
 from robot.recordings.real_whiskers import WHISKERS, ReachConfig, ReachRecord, read_reach
+from tactile import contact_stream
 from tactile.base.errors import InputError
 from tactile.base.samples import true_runs
 from tactile.calibration import FreeBaseline, calibrate_free
-from tactile.contact_stream import (
-    StreamState,
-    Touch,
-    date_back,
-    find_contacts,
-    find_fixed_contacts,
-    start_stream,
-)
 
 CONTACT_SDS = 20.0
 """Departure that makes a contact of the record one to find in the spliced hours: the paper's."""
@@ -127,13 +120,13 @@ class _ContactResult(NamedTuple):
 
 def _list_contacts(result: _ContactResult) -> list[str]:
     """The tables of the page."""
-    hours = [markdown_header(
-        ("stream", "rule", "contacts longer than 0.1 s", "missed", "false contacts", "share of free rows")
-    )]  # fmt: skip
-    for stream, scores in result.streams.items():
-        for rule, (contacts, missed, false, wrong, free) in scores.items():
-            hours.append(markdown_row([stream, rule, contacts, missed, false, f"{wrong / free:.2g}"]))
-    parts = (_whisker_table(result), hours, result.marks, _sentences(result))
+    columns = "stream", "rule", "contacts longer than 0.1 s", "missed", "false contacts", "share of free rows"
+    hours = [
+        [stream, rule, *counts, f"{wrong / free:.2g}"]
+        for stream, scores in result.streams.items()
+        for rule, (*counts, wrong, free) in scores.items()
+    ]
+    parts = (_whisker_table(result), table_lines([], columns, hours), result.marks, _sentences(result))
     return [line for part in parts for line in ("", *part)][1:]
 
 
@@ -141,13 +134,13 @@ def _whisker_table(result: _ContactResult) -> list[str]:
     half = len(result.contact) // 2
     halves = [part.mean(axis=0) for part in (result.contact[:half], result.contact[half:])]
     columns = "in contact, first half", "second half", "contacts", "20-sd rule", "contacts", "remark"
-    lines = [markdown_header(("whisker", *columns))]
+    rows = []
     for w, name in enumerate(WHISKERS):
         tracked, fixed = (len(true_runs(found[:, w])) for found in (result.contact, result.fixed))
         early, late = (f"{part[w]:.1%}" for part in halves)
         share = f"{result.fixed[:, w].mean():.1%}"
-        lines.append(markdown_row([name, early, late, tracked, share, fixed, _remark(result, w)]))
-    return lines
+        rows.append([name, early, late, tracked, share, fixed, _remark(result, w)])
+    return table_lines([], ("whisker", *columns), rows)
 
 
 def _remark(result: _ContactResult, whisker: int) -> str:
@@ -247,51 +240,41 @@ def _measure_contacts(data: Path) -> _ContactResult:
     signal, first = record.signal, record.signal[: config.free_rows]
     free = calibrate_free(config.free, first)
     touch, baseline = _follow(config, free, signal)
-    fixed = find_fixed_contacts(first, signal)
+    fixed = contact_stream.find_fixed_contacts(first, signal)
     dirty = np.array([whisker in free.dirty for whisker in range(len(WHISKERS))])
     away = np.abs(signal - free.mean).max(axis=0) / free.noise
     never = (away < CONTACT_SDS).all(axis=1)
-    contact = touch == Touch.CONTACT
+    contact = touch == contact_stream.Touch.CONTACT
+    bent = (touch == contact_stream.Touch.BENT).any(axis=0)
     tripled = {name: _score_tripled(config, free, signal, contact, name) for name in RULES}
-    return _ContactResult(
-        config=config,
-        record=record,
-        free=free,
-        away=away.max(axis=1),
-        contact=contact,
-        bent=(touch == Touch.BENT).any(axis=0),
-        fixed=fixed,
-        baseline=baseline,
-        never=never,
-        streams={
-            "the record, each baseline times 3": tripled,
-            **_score_hours(config, free, signal, never, dirty),
-        },
-        marks=_mark_lines(dict(zip(RULES, (contact, fixed), strict=True)), ~never & ~dirty),
-    )
+    hours = _score_hours(config, free, signal, never, dirty)
+    streams = {"the record, each baseline times 3": tripled, **hours}
+    marks = _mark_lines(dict(zip(RULES, (contact, fixed), strict=True)), ~never & ~dirty)
+    away = away.max(axis=1)
+    return _ContactResult(config, record, free, away, contact, bent, fixed, baseline, never, streams, marks)
 
 
 def _follow(config: ReachConfig, free: FreeBaseline, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[T, W] states, each contact from its first row on, and the baselines [T, W, K]."""
-    plan, state = start_stream(config.contact, free, config.rate)
+    plan, state = contact_stream.start_stream(config.contact, free, config.rate)
     parts, baselines = [], []
     for first in range(0, len(signal), plan.block):
         baselines.append(np.repeat(state.baseline[None], len(signal[first : first + plan.block]), axis=0))
-        state, touch = find_contacts(plan, state, signal[first : first + plan.block])
+        state, touch = contact_stream.find_contacts(plan, state, signal[first : first + plan.block])
         parts.append(touch)
-    return date_back(plan, np.concatenate(parts)), np.concatenate(baselines)
+    return contact_stream.date_back(plan, np.concatenate(parts)), np.concatenate(baselines)
 
 
 def _decide(config: ReachConfig, free: FreeBaseline, name: str) -> Decide:
     """A rule by name, for a stream whose baseline and noise are known at its start."""
     if name == "20 sd":
         return lambda samples: (np.abs(samples - free.mean) > CONTACT_SDS * free.noise).any(axis=-1)
-    plan, start = start_stream(config.contact, free, config.rate)
-    states: list[StreamState] = [start]
+    plan, start = contact_stream.start_stream(config.contact, free, config.rate)
+    states: list[contact_stream.StreamState] = [start]
 
     def decide(samples: np.ndarray) -> np.ndarray:
-        states[0], touch = find_contacts(plan, states[0], samples)
-        return touch == Touch.CONTACT
+        states[0], touch = contact_stream.find_contacts(plan, states[0], samples)
+        return touch == contact_stream.Touch.CONTACT
 
     return decide
 
@@ -369,20 +352,19 @@ def _mark_lines(contacts: dict[str, np.ndarray], touching: np.ndarray) -> list[s
         return ["Precision and recall: not annotated."]
     one, other = marks.values()
     agreed = np.where(one == other, one, UNCLEAR)
-    lines = [
+    above = (
         f"Annotators {' and '.join(marks)}: agreement {(one == other).mean():.1%} of rows, unclear "
-        f"{(agreed == UNCLEAR).mean():.1%} (goal: at most 15 %).",
-        "",
-        "| whisker | rule | unclear | precision | recall | unclear counted as wrong: precision | recall |",
-        "|---|---|---|---|---|---|---|",
-    ]
+        f"{(agreed == UNCLEAR).mean():.1%} (goal: at most 15 %)."
+    )
+    columns = "precision", "recall", "unclear counted as wrong: precision", "recall"
+    lines = []
     rows: list[tuple[str, str, Any]] = [("**those that touch**", rule, touching) for rule in contacts]
     rows += [(name, rule, w) for rule in contacts for w, name in enumerate(WHISKERS)]
     for name, rule, which in rows:
         *figures, unclear = score_contacts(contacts[rule][:, which], agreed[:, which])
         shown = ("-" if np.isnan(figure) else f"{figure:.3f}" for figure in figures)
-        lines.append(markdown_row([name, rule, f"{unclear:.1%}", *shown]))
-    return lines
+        lines.append([name, rule, f"{unclear:.1%}", *shown])
+    return table_lines([above], ("whisker", "rule", "unclear", *columns), lines)
 
 
 FIGURE = Figure(

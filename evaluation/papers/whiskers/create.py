@@ -16,11 +16,13 @@ import numpy as np
 from evaluation.metrics.trajectory import align, ate
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.buildings import buildings_rows
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import metres, require_recordings
-from evaluation.papers.trial_sessions import RecordingRun, closure_claims, run_recording
+from evaluation.papers.trial_sessions import closure_claims, known_ate, run_recording
 from evaluation.papers.whiskers.bumps import wall_distances
 from evaluation.plots.style import BLUE, GREY, INK, VERMILLION, add_axes, name_axes, new_figure
+from evaluation.studies.metrics import SessionResult
+from ratslam.core.backend import Map
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap
@@ -68,38 +70,37 @@ class Variant(NamedTuple):
     revisits: float
 
 
-def _measure_variant(run: RecordingRun) -> Variant:
-    """The figures of a session."""
-    claims, slam_map = closure_claims(run), run.session.map
+def _measure_variant(slam_map: Map, run: SessionResult) -> Variant:
+    """The figures of a session with this map."""
+    claims, paths = closure_claims(slam_map, run.truth), (run.odometry, run.trajectory, run.live)
+    odometry, final, live = (known_ate(path, run.truth) for path in paths)
     false = (claims.distance > FALSE_DISTANCE) | (claims.turn > FALSE_TURN)
     return Variant(
-        odometry=run.ate(run.odometry),
-        final=run.ate(run.final),
-        live=run.ate(run.online),
-        map=run.ate(slam_map.map_trajectory()),
+        odometry,
+        final,
+        live,
+        known_ate(slam_map.map_trajectory(), run.truth),
         doubt=slam_map.final_doubt(),
         accepted=int(claims.accepted.sum()),
         false=int((false & claims.accepted).sum()),
         candidates=len(false),
         right=int((~false).sum()),
-        revisits=_revisits_ate(run, slam_map) if isinstance(slam_map, KeyframeMap) else float("nan"),
+        revisits=_revisits_ate(slam_map, run.truth) if isinstance(slam_map, KeyframeMap) else float("nan"),
     )
 
 
-def _revisits_ate(run: RecordingRun, slam_map: KeyframeMap) -> float:
+def _revisits_ate(slam_map: KeyframeMap, truth: np.ndarray) -> float:
     """ATE of the keyframes with the true revisits as closures in the same graph, m: what recall could give
     if it recognised every revisit, with the sectors' resolution, and nothing else."""
     graph, steps = slam_map.keyframes().copy(), slam_map.keyframe_steps()
-    truth, log = run.truth[steps], ClosureLog()
+    truth, log = truth[steps], ClosureLog()
     for candidate in true_revisits(graph, truth):
         last = log.last()
         log.add(candidate, last is not None and candidate.keyframe - last.keyframe <= graph.config.max_gap)
     for sequence in range(log.sequences):
         log.judge(sequence, Verdict.ACCEPTED)
     graph.dead_reckon()
-    known = np.isfinite(truth).all(axis=1)
-    poses = cheapest_map(graph, log, [graph.start]).fit.poses
-    return ate(poses[known], truth[known])
+    return known_ate(cheapest_map(graph, log, [graph.start]).fit.poses, truth)
 
 
 def true_revisits(graph: KeyframeGraph, truth: np.ndarray) -> Iterator[Candidate]:
@@ -115,10 +116,8 @@ def true_revisits(graph: KeyframeGraph, truth: np.ndarray) -> Iterator[Candidate
             yield Candidate(k, match, shift, 1.0, REVISIT_SCORE)
 
 
-def _true_turns_ate(run: RecordingRun) -> float:
+def _true_turns_ate(odometry: np.ndarray, truth: np.ndarray) -> float:
     """ATE of odometry whose turns are replaced by the true ones, m: what is left if headings were known."""
-    known = np.isfinite(run.truth).all(axis=1)
-    odometry, truth = run.odometry[known], run.truth[known]
     motion = between(odometry[:-1], odometry[1:])
     forward = motion[:, 0] * np.cos(motion[:, 2] / 2) + motion[:, 1] * np.sin(motion[:, 2] / 2)
     turn = wrap(np.diff(truth[:, 2]))
@@ -157,31 +156,26 @@ def _measure_create(folder: Path) -> CreateResult:
     configs = {"classic": rows[DEFAULT].recording.configuration("backend=classic")}
     variants = {}
     for name, config in (configs | {name: row.configuration() for name, row in rows.items()}).items():
-        run = run_recording(config)
-        variants[name] = _measure_variant(run)
+        _, session, run = run_recording(config)
+        variants[name] = _measure_variant(session.map, run)
         if name == DEFAULT:
-            default = run
+            default, mapped = run, session.map.map_trajectory()
     known = np.isfinite(default.truth).all(axis=1)
-    error = np.unwrap((default.odometry - default.truth)[known, 2])
+    truth, odometry = default.truth[known], default.odometry[known]
+    error = np.unwrap((odometry - truth)[:, 2])
     # The estimates after the rigid motions that bring them nearest to the truth.
-    truth = default.truth[known]
-    estimates = {"odometry": default.odometry[known], "map": default.session.map.map_trajectory()[known]}
+    estimates = {"odometry": odometry, "map": mapped[known]}
     paths = {name: compose(align(poses, truth), poses) for name, poses in estimates.items()}
-    return CreateResult(
-        variants=variants,
-        true_turns=_true_turns_ate(default),
-        drift=float(np.ptp(error)),
-        latency=float(np.median(depth["latency"])),
-        paths=paths | {"truth": truth},
-        walls=segments,
-        distances=distances,
-    )
+    paths["truth"] = truth
+    true_turns = _true_turns_ate(odometry, truth)
+    drift, latency = float(np.ptp(error)), float(np.median(depth["latency"]))
+    return CreateResult(variants, true_turns, drift, latency, paths, segments, distances)
 
 
 def _table_create(result: CreateResult) -> list[str]:
     """The lines of the tables."""
     odometry = metres(next(iter(result.variants.values())).odometry)
-    lines = [markdown_header(COLUMNS), markdown_row(["odometry (control)", odometry, odometry, *["-"] * 6])]
+    rows = [["odometry (control)", odometry, odometry, *["-"] * 6]]
     for name, variant in result.variants.items():
         label = f"{name} (control)"
         if name.startswith("create "):
@@ -194,15 +188,16 @@ def _table_create(result: CreateResult) -> list[str]:
             share = f"{variant.candidates}, {variant.right / max(variant.candidates, 1):.0%}"
             cells += [f"{variant.doubt:.2f}", f"{variant.accepted}", f"{variant.false}", share]
             cells.append(metres(variant.revisits))
-        lines.append(markdown_row([label, *cells]))
-    lines.append(markdown_row(["odometry, true turns (bound)", metres(result.true_turns), *["-"] * 7]))
-    walls = [markdown_header(("robot to the nearest wall, m", "number", *(f"{p} %" for p in PERCENTILES)))]
+        rows.append([label, *cells])
+    rows.append(["odometry, true turns (bound)", metres(result.true_turns), *["-"] * 7])
+    walls = []
     names = "at the first reading of a contact", "at all readings (control)"
     for name, values in zip(names, result.distances, strict=True):
         spread = np.percentile(values, PERCENTILES)
-        walls.append(markdown_row([name, len(values), *(f"{value:.3f}" for value in spread)]))
+        walls.append([name, len(values), *(f"{value:.3f}" for value in spread)])
+    columns = "robot to the nearest wall, m", "number", *(f"{p} %" for p in PERCENTILES)
     caveats = CAVEATS.format(drift=result.drift, latency=result.latency)
-    return [*lines, "", _summary(result), "", *walls, "", caveats]
+    return table_lines([], COLUMNS, rows, table_lines([_summary(result)], columns, walls, [caveats]))
 
 
 CAVEATS = (
@@ -217,10 +212,7 @@ def _summary(result: CreateResult) -> str:
     """The line below the table over all settings of recall."""
     found = [variant for name, variant in result.variants.items() if name.startswith("create ")]
     odometry = found[0].odometry
-    final, live, drawn, bound = (
-        np.array([getattr(variant, name) for variant in found])
-        for name in ("final", "live", "map", "revisits")
-    )
+    final, live, drawn, bound = np.array([[v.final, v.live, v.map, v.revisits] for v in found]).T
     doubted = sum(variant.doubt > DOUBTED for variant in found)
     above = [int((errors > odometry + 1e-6).sum()) for errors in (final, live)]
     return (

@@ -19,7 +19,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 
 from evaluation.papers.figure import Figure
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import REACH, require_recordings
 from robot.recordings.real_whiskers import read_columns, read_reach
 from robot.simulation.head.baseline import HALL_BASELINE, Baseline, BaselineConfig
@@ -122,13 +122,10 @@ def free_figures(record: np.ndarray, rate: float) -> _FreeFigures:
     grown = (2 * _mean_change(record, span)[0] / noise - 2).mean() * rate / span[0]
     level = uniform_filter1d(record, BLOCK, axis=0)[BLOCK // 2 : -BLOCK // 2] / np.sqrt(noise)
     extent, spans = np.ptp(level, axis=0), SPANS[: np.searchsorted(SPANS, len(record) // 2)]
-    return _FreeFigures(
-        correlation=correlation,
-        change=np.sqrt(np.mean(2 * _mean_change(record, spans) / noise, axis=1)),
-        time=float(-1 / (rate * np.log(correlation[0]))) if correlation[0] > COLOURED else None,
-        drift=float(np.sqrt(max(grown, 0.0))),
-        range=(float(extent.min()), float(extent.max())),
-    )
+    change = np.sqrt(np.mean(2 * _mean_change(record, spans) / noise, axis=1))
+    time = float(-1 / (rate * np.log(correlation[0]))) if correlation[0] > COLOURED else None
+    least, largest = float(extent.min()), float(extent.max())
+    return _FreeFigures(correlation, change, time, float(np.sqrt(max(grown, 0.0))), (least, largest))
 
 
 def creep_figures(signal: np.ndarray, time: float | None) -> Creep:
@@ -207,7 +204,7 @@ CAVEATS = (
 
 def _table_drift(result: DriftResult) -> list[str]:
     """The lines of the table."""
-    lines = [markdown_header(COLUMNS)]
+    rows = []
     for name, free in result[0].items():
         cells = [LABELS.get(name, name), f"{free.correlation[0]:.2f}"]
         cells += ["white" if free.time is None else f"{1000 * free.time:.1f} ms", f"{free.drift:.2f}"]
@@ -216,8 +213,8 @@ def _table_drift(result: DriftResult) -> list[str]:
             time, shares, _ = creep
             cells.append(f"{np.median(shares):.3f} ({shares.min():.3f}-{shares.max():.3f})")
             cells.append(f"{time:.2f} s")
-        lines.append(markdown_row([*cells, *["-"] * (len(COLUMNS) - len(cells))]))
-    return [*lines, "", CAVEATS]
+        rows.append([*cells, *["-"] * (len(COLUMNS) - len(cells))])
+    return table_lines([], COLUMNS, rows, [CAVEATS])
 
 
 def _draw_drift(result: DriftResult, png: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from evaluation.metrics.trajectory import ate
 from evaluation.papers.figure import Figure
-from evaluation.papers.tables.markdown import markdown_row
+from evaluation.papers.tables.markdown import markdown_row, table_lines
 from evaluation.papers.tables.recordings import REACH, require_recordings
 from evaluation.plots import style
 from ratslam.runs.build_session import open_source
@@ -33,8 +33,12 @@ RECORDS = {
 """Configuration and odometry of each record with truth."""
 CREATE, MAPPED = "real Create", ("Intel lab", "ACES")
 """The record that is drawn; those whose revisits are compared with the truth."""
-VALUES = {"length_scale": 1.0, "turn_scale": 1.0, "heading_bias": 0.0}
-"""The quantities of the table, and what is assumed."""
+VALUES = {
+    "length_scale": (1.0, "distance, true / measured"),
+    "turn_scale": (1.0, "turn, true / measured"),
+    "heading_bias": (0.0, "heading bias, rad/m"),
+}
+"""The quantities of the table: what is assumed, and the label of the axis."""
 
 
 _Record = tuple[list[WheelFit], list[tuple[np.ndarray, ...]], Rig | None]
@@ -54,24 +58,9 @@ def _measure(folder: Path) -> _Rigs:
     return records, signals, fit_signals(signals)
 
 
-def _assignments(name: str, folder: Path) -> list[str]:
-    """Settings that make the packaged configuration read this record of this folder."""
-    config, file = RECORDS[name]
-    parts = {
-        "create_lab": {"views.file": "data/create_lab_depth.csv", "truth.file": "data/create_lab_truth.csv"},
-        "intel_laser": {"views.file": "data/intel_scans.csv"},
-        "tuc_lecture_hall": {
-            "pairs.file": "data/tuc_lecture_hall_loops.csv",
-            "truth.file": "data/tuc_lecture_hall_gt.csv",
-        },
-    }.get(config, {})
-    named = [f"recording.table.{key}={folder / path}" for key, path in parts.items()]
-    relations = ["score.relations=null"] if config == "intel_laser" else []
-    return [f"recording.file={folder / file}", *named, *relations]
-
-
 def _measure_wheels(name: str, folder: Path) -> _Record:
-    config = load_config(RECORDS[name][0], _assignments(name, folder))
+    packaged, file = RECORDS[name]
+    config = load_config(packaged, [f"recording.file={folder / file}"])
     with open_source(config) as source:
         log = load_into_memory(source)
     half = log.length // 2
@@ -98,29 +87,27 @@ def _errors(records: dict[str, _Record]) -> np.ndarray:
 def _table(result: _Rigs) -> list[str]:
     """The wheels by record and half, dead reckoning before and after, and the whiskers of the arm."""
     records, signals, whiskers = result
-    lines = [
-        "Wheels: each quantity of the whole record, and of its first and second half.",
-        "",
-        "| record | true over measured distance | true over measured turn | heading bias, rad/m |",
-        "|---|---|---|---|",
-    ]
+    wheels = []
     for name, (fits, _, revisits) in records.items():
         cells = ["; ".join(_pair(getattr(fit, key)) for fit in fits) for key in VALUES]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
+        wheels.append([name, *cells])
         if revisits is not None:
             known = {one.name: (one.value, one.sd or 0.0) for one in revisits.quantities}
             turn, bias = _pair(known.get("turn scale")), _pair(known["heading bias"])
-            lines.append(f"| {name}, from revisits alone | not told by revisits | {turn} | {bias} |")
-    lines += [
-        "",
-        "Dead reckoning (ATE, m) of each half: as recorded, and with what the other half tells.",
-        "",
-        "| record | first half | corrected by the second | second half | corrected by the first |",
-        "|---|---|---|---|---|",
-    ]
-    for name, errors in zip(records, _errors(records), strict=True):
-        lines.append(markdown_row([name, *(f"{error:.2f}" for error in errors.flat)]))
-    return [*lines, "", *_whisker_lines(signals, whiskers)]
+            wheels.append([f"{name}, from revisits alone", "not told by revisits", turn, bias])
+    reckoned = (
+        [name, *(f"{error:.2f}" for error in errors.flat)]
+        for name, errors in zip(records, _errors(records), strict=True)
+    )
+    halves = table_lines(
+        ["Dead reckoning (ATE, m) of each half: as recorded, and with what the other half tells."],
+        ("record", "first half", "corrected by the second", "second half", "corrected by the first"),
+        reckoned,
+        _whisker_lines(signals, whiskers),
+    )
+    above = "Wheels: each quantity of the whole record, and of its first and second half."
+    columns = "record", "true over measured distance", "true over measured turn", "heading bias, rad/m"
+    return table_lines([above], columns, wheels, halves)
 
 
 def _whisker_lines(signals: SignalRecord, fit: SignalFit) -> list[str]:
@@ -163,25 +150,20 @@ def _draw(result: _Rigs, png: Path) -> None:
     title = "What a record tells of its rig"
     line = "Wheels against truth, half against half; noise of the whiskers of an arm in clutter"
     figure = style.new_figure(9.6, title, line)
-    for k, (key, assumed) in enumerate(VALUES.items()):
-        _draw_intervals(
-            style.add_axes(figure, 1.25 + 2.25 * k, 6.25, 1.95, 2.15), records, key, assumed, k == 0
-        )
+    for k, key in enumerate(VALUES):
+        _draw_intervals(style.add_axes(figure, 1.25 + 2.25 * k, 6.25, 1.95, 2.15), records, key, k == 0)
     fits, paths, _ = records[CREATE]
     for k, half in enumerate(("first half", "second half")):
         other = fits[2 - k].correction
-        label = (
-            f"{half}, corrected by the other" if other != UNCORRECTED else f"{half}: the other is not sure"
-        )
-        _draw_paths(style.add_axes(figure, 0.62 + 2.45 * k, 3.35, 2.2, 2.2), paths[k], label)
+        how = ", corrected by the other" if other != UNCORRECTED else ": the other is not sure"
+        _draw_paths(style.add_axes(figure, 0.62 + 2.45 * k, 3.35, 2.2, 2.2), paths[k], half + how)
     _draw_ate(style.add_axes(figure, 5.75, 3.45, 1.95, 2.05), records)
     _draw_whiskers(style.add_axes(figure, 0.75, 0.7, 6.9, 1.6), signals, whiskers)
     figure.savefig(png)
 
 
-def _draw_intervals(
-    axes: style.Axes, records: dict[str, _Record], key: str, assumed: float, named: bool
-) -> None:
+def _draw_intervals(axes: style.Axes, records: dict[str, _Record], key: str, named: bool) -> None:
+    assumed, label = VALUES[key]
     axes.axvline(assumed, color=style.GREY, lw=1)
     colours = (style.INK, style.BLUE, style.VERMILLION)
     for row, (fits, *_) in enumerate(records.values()):
@@ -191,29 +173,16 @@ def _draw_intervals(
             axes.errorbar(value, at, xerr=2 * sd, fmt="o", ms=3, lw=1.2, color=colour)
     ticks = [-row for row in range(len(records))]
     axes.set_yticks(ticks, list(records) if named else [""] * len(ticks))
-    axes.set_xlabel(
-        {"length_scale": "distance, true / measured", "turn_scale": "turn, true / measured"}.get(
-            key, "heading bias, rad/m"
-        ),
-        color=style.LABEL_GREY, fontsize=9,
-    )  # fmt: skip
+    axes.set_xlabel(label, color=style.LABEL_GREY, fontsize=9)
     axes.grid(axis="x", color=style.LINE_GREY, lw=0.7)
     if named:
-        for colour, word, at in zip(
-            colours, ("whole", "first half", "second half"), (0, 0.8, 1.8), strict=True
-        ):
-            axes.annotate(
-                word, (0, 1), (72 * (at - 0.3), 6), "axes fraction", "offset points",
-                color=colour, fontsize=8.5,
-            )  # fmt: skip
+        words, offset = ("whole", "first half", "second half"), ("axes fraction", "offset points")
+        for colour, word, at in zip(colours, words, (0, 0.8, 1.8), strict=True):
+            axes.annotate(word, (0, 1), (72 * (at - 0.3), 6), *offset, color=colour, fontsize=8.5)
 
 
 def _draw_paths(axes: style.Axes, paths: tuple[np.ndarray, ...], label: str) -> None:
-    words = (
-        ("truth", style.GREY, 3.0),
-        ("as recorded", style.VERMILLION, 1.0),
-        ("corrected", style.BLUE, 1.0),
-    )
+    words = ("truth", style.GREY, 3.0), ("as recorded", style.VERMILLION, 1.0), ("corrected", style.BLUE, 1.0)
     truth, *found = paths
     aligned = truth, *(compose(fit_rigid_motion(path, truth), path) for path in found)
     for path, (word, colour, width) in zip(aligned, words, strict=True):
@@ -243,10 +212,9 @@ def _draw_ate(axes: style.Axes, records: dict[str, _Record]) -> None:
 def _draw_whiskers(axes: style.Axes, signals: SignalRecord, fit: SignalFit) -> None:
     at = np.arange(len(signals.names))
     for channel, shift in enumerate((-0.25, 0.0, 0.25)):
-        label = "noise" if channel == 0 else None
-        axes.bar(at + shift, fit.noise[:, channel], 0.22, color=style.BLUE, alpha=0.45, label=label)
-        white = "white part" if channel == 0 else None
-        axes.bar(at + shift, fit.white[:, channel], 0.22, color=style.BLUE, label=white)
+        labels = ("noise", "white part") if channel == 0 else (None, None)
+        axes.bar(at + shift, fit.noise[:, channel], 0.22, color=style.BLUE, alpha=0.45, label=labels[0])
+        axes.bar(at + shift, fit.white[:, channel], 0.22, color=style.BLUE, label=labels[1])
     for k in fit.dirty:
         axes.annotate(
             "dirty free record", (k + 0.4, 1.12 * fit.noise.max()), ha="right", fontsize=8.5,

@@ -17,6 +17,7 @@ from scipy.special import expit, logit
 
 from evaluation.metrics.statistics import auc, expected_calibration_error
 from evaluation.papers.figure import Figure
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import require_recordings
 from ratslam.recall.signed_likelihood import learn, log_odds, project, stored_image
 from robot.recordings.real_whiskers import read_contacts, read_object
@@ -125,11 +126,11 @@ def _table(result: _Likeness) -> list[str]:
     chosen = [block for k, block in enumerate(blocks) if k in DEVELOPED]
     confirmed = [block for k, block in enumerate(blocks) if k not in DEVELOPED]
     names = ("log-odds", *DISTANCES)
-    lines = [
-        "| images | AUC (least of a block) | AUC of absolute differences | calibration error | recognised by "
-        + " | ".join(names) + " | chance |",
-        "|---|" + "---|" * (len(names) + 4),
-    ]  # fmt: skip
+    columns = (
+        "images", "AUC (least of a block)", "AUC of absolute differences", "calibration error",
+        f"recognised by {names[0]}", *DISTANCES, "chance",
+    )  # fmt: skip
+    lines = []
     rows: list[tuple[str, list[_HeldOut], bool]] = [
         ("8 whiskers, 10 objects, blocks 1-3 (model chosen on these)", chosen, True),
         ("the same, blocks 4-6 (confirming)", confirmed, True),
@@ -140,15 +141,13 @@ def _table(result: _Likeness) -> list[str]:
         odds, same, distance = _pooled(parts)
         areas = [auc(part.odds[~part.same], part.odds[part.same]) for part in parts]
         least = f" ({min(areas):.3f})" if by_block else ""
-        cells = [
-            f"{auc(odds[~same], odds[same]):.3f}{least}",
-            f"{auc(-distance[~same], -distance[same]):.3f}",
-        ]
+        cells = [label, f"{auc(odds[~same], odds[same]):.3f}{least}"]
+        cells += [f"{auc(-distance[~same], -distance[same]):.3f}"]
         cells += [f"{expected_calibration_error(_probabilities(odds, same), same, BINS):.3f}"]
         cells += [f"{np.mean([part.recognised[name] for part in parts]):.3f}" for name in names]
         chance = np.mean([part.same.mean() for part in parts])  # share of pairs of one object
-        lines.append(f"| {label} | {' | '.join(cells)} | {chance:.2f} |")
-    return [*lines, "", *NOTES]
+        lines.append([*cells, f"{chance:.2f}"])
+    return table_lines([], columns, lines, NOTES)
 
 
 NOTES = [
@@ -175,11 +174,8 @@ def _draw(result: _Likeness, png: Path) -> None:
             # Shares of the pairs of two objects and of one that are taken for one, as the limit falls.
             truth = same[np.argsort(-score, kind="stable")]
             shown = np.linspace(0, len(truth) - 1, min(len(truth), 2000)).astype(int)
-            wrong, right = (
-                (np.cumsum(~truth) / (~truth).sum())[shown],
-                (np.cumsum(truth) / truth.sum())[shown],
-            )
-            axes[0].plot(wrong, right, style, color=color, label=f"{label}: {of}")
+            shares = [(np.cumsum(found) / found.sum())[shown] for found in (~truth, truth)]
+            axes[0].plot(*shares, style, color=color, label=f"{label}: {of}")
         # Mean probability of one object against the share of such pairs, in bins of equally many pairs.
         chance = _probabilities(odds, same)
         bins = np.array_split(np.argsort(chance, kind="stable"), BINS)

@@ -19,6 +19,7 @@ import numpy as np
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.trajectory import align
 from evaluation.papers.figure import Figure
+from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import require_recordings
 from evaluation.papers.trial_sessions import collect_session, run_session
 from evaluation.papers.whiskers.likeness import OBJECTS
@@ -128,30 +129,28 @@ def _energy(result: SessionResult, steps: int | None = None, *, odometry: bool =
 
 def _table(walks: list[_WalkResult]) -> list[str]:
     """The lines of the table."""
-    lines = [
-        "| maze | whisks | EM | odometry | simulated whiskers | one direction only | shuffled (closures) "
-        "| true path, odometry after the reversal | median of draws (share that reaches the goal) | the same "
-        "from the map | first three circuits | odometry there | false / closures (after the reversal) |",
-        f"|{'---|' * 13}",
-        *(_line(walk) for walk in walks),
-    ]
+    columns = (
+        "maze", "whisks", "EM", "odometry", "simulated whiskers", "one direction only", "shuffled (closures)",
+        "true path, odometry after the reversal", "median of draws (share that reaches the goal)",
+        "the same from the map", "first three circuits", "odometry there",
+        "false / closures (after the reversal)",
+    )  # fmt: skip
     reached, three = (
         sum(_energy(walk.real, steps) <= GOAL for walk, steps in zip(walks, ends, strict=True))
         for ends in ([None] * len(walks), [walk.turned for walk in walks])
     )
     heading = np.sqrt(np.mean([walk.heading**2 for walk in walks]))
     bound, from_map = np.mean([(walk.drawn <= GOAL).mean(axis=1) for walk in walks], axis=0)
-    return [
-        *lines,
-        "",
+    below = (
         f"EM (m^2 + rad^2) is at most {GOAL} in {reached} of {len(walks)} walks, over the first three "
         f"circuits in {three}. {NOTE} The draws are {DRAWS} of the noise of odometry after the reversal: a "
         f"perfect map of three circuits reaches the goal in {bound:.0%} of them, this map in {from_map:.0%}: "
-        f"its heading at the reversal, which turns all that follows, errs by {heading:.2f} rad (rms).",
-    ]
+        f"its heading at the reversal, which turns all that follows, errs by {heading:.2f} rad (rms)."
+    )
+    return table_lines([], columns, map(_cells, walks), [below])
 
 
-def _line(walk: _WalkResult) -> str:
+def _cells(walk: _WalkResult) -> list[str]:
     """The row of a walk."""
     real, three = walk.real, walk.turned
     false = closure_errors(real.truth, real.closures) > FALSE_CLOSURE_DISTANCE
@@ -162,8 +161,7 @@ def _line(walk: _WalkResult) -> str:
     cells += [f"{_energy(walk.shuffled):.3f} ({len(walk.shuffled.closures)})", f"{walk.reckoned:.3f}"]
     cells += [f"{np.median(drawn):.3f} ({(drawn <= GOAL).mean():.0%})" for drawn in walk.drawn]
     cells += [f"{_energy(real, three):.3f}", f"{_energy(real, three, odometry=True):.3f}"]
-    cells += [f"{false.sum()} / {len(false)} ({false[late].sum()} / {late.sum()})"]
-    return f"| {' | '.join(cells)} |"
+    return [*cells, f"{false.sum()} / {len(false)} ({false[late].sum()} / {late.sum()})"]
 
 
 NOTE = (
@@ -183,11 +181,8 @@ def _draw(walks: list[_WalkResult], png: Path) -> None:
         for axis, (name, path) in zip(column, paths.items(), strict=True):
             aligned = compose(align(path[: walk.turned], walk.real.truth[: walk.turned]), path)
             axis.plot(*walk.real.truth[:, :2].T, color="0.75", lw=3, label="truth")
-            parts = (
-                (slice(walk.turned), "C0", "three circuits"),
-                (slice(walk.turned - 1, None), "C1", "fourth"),
-            )
-            for part, color, label in parts:
+            three, fourth = slice(walk.turned), slice(walk.turned - 1, None)
+            for part, color, label in ((three, "C0", "three circuits"), (fourth, "C1", "fourth")):
                 axis.plot(*aligned[part, :2].T, color=color, lw=1, label=label)
             error = energy_all_pairs(path, walk.real.truth).total
             axis.set(title=f"{name}, EM {error:.3f}", xticks=[], yticks=[])

@@ -16,6 +16,7 @@ from evaluation.papers.salman2016.paper_figures import (
     draw_measured,
     draw_tuning,
 )
+from evaluation.studies.metrics import ViewDifferences
 
 RANDOM = np.random.default_rng(0)
 WAY = np.cumsum(RANDOM.normal(size=(40, 2)), axis=0)
@@ -55,7 +56,8 @@ def curves():
 
 def tuning(winner=0.05):
     grid = np.arange(4) / 20
-    return draw_tuning(EDGE, np.arange(10), np.ones(10), 0.9, grid, np.arange(4), np.ones(4), winner)
+    views = ViewDifferences(EDGE, np.arange(10), np.ones(10), 0.9)
+    return draw_tuning(views, np.array([grid, np.arange(4), np.ones(4)]), winner)
 
 
 ALL = (drift, experiences, measured, directions, curves, tuning)

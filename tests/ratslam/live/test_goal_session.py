@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from evaluation.metrics.trajectory import write_tum
-from evaluation.papers.maps.scenarios import Recipe, touch_config
+from evaluation.papers.maps.scenarios import Recipe
 from evaluation.papers.maps.stored_maps import store_map
-from evaluation.papers.tables.touch_table import MAIN
+from evaluation.papers.tables.touch_table import MAIN, touch_config
 from ratslam.live.arm_session import plan_goals
 from ratslam.runs.settings.run_config import load_config
 from robot.live.arm_route import plan_path
@@ -45,7 +45,7 @@ def test_the_arm_begins_where_the_session_of_the_map_ended(tmp_path: Path) -> No
 @pytest.mark.soak
 @pytest.mark.timeout(1200)
 def test_a_session_reaches_its_goals(loopback: str, tmp_path: Path) -> None:
-    made = store_map(Recipe(touch_config(MAZE, 1, MAIN | {"path": {"circuits": CIRCUITS}}, {})), tmp_path)
+    made = store_map(Recipe(touch_config(MAZE, 1, MAIN | {"path": {"circuits": CIRCUITS}})), tmp_path)
     settings = [
         *PATIENT, "live.budget=5", "live.plan.seed=1", f"live.plan.maze.seed={MAZE}",
         f"live.plan.path.circuits={CIRCUITS}", "live.plan.motion.jitter.position=0.005",

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from evaluation.papers.maps.goals import GOALS, ClosedLoop, Drive, goal_figures, shortest_driven
-from evaluation.papers.maps.scenarios import Recipe, open_world, touch_config
+from evaluation.papers.maps.scenarios import Recipe, open_world
 from evaluation.papers.maps.stored_maps import store_map
-from evaluation.papers.tables.touch_table import MAIN
+from evaluation.papers.tables.touch_table import MAIN, touch_config
 from ratslam.live.goal_drive import DriveState
 from robot.world.maze import cell_centre
 from tests.evaluation.papers.maps.stand_ins import cells_by_figure
@@ -57,7 +57,7 @@ def test_only_true_ends_count_as_reached(tmp_path: Path):
 
 def test_the_arm_drives_to_a_goal_on_its_map(tmp_path: Path):
     settings = MAIN | {"path": {"circuits": "CCC"}}
-    recipe = Recipe(touch_config(MAZE, 1, settings, {}))
+    recipe = Recipe(touch_config(MAZE, 1, settings))
     loop = ClosedLoop(recipe, store_map(recipe, tmp_path))
     far = {place: loop.way_to(place)[0] for place in loop.experiences}
     goal = min(far, key=lambda place: abs(far[place] - 0.4))

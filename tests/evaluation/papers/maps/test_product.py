@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from evaluation.papers.maps.operations import Methods
-from evaluation.papers.maps.scenarios import Recipe, touch_config
+from evaluation.papers.maps.scenarios import Recipe
 from evaluation.papers.maps.stored_maps import store_map
+from evaluation.papers.tables.touch_table import touch_config
 from tests.ratslam.runs.touch_walks import SMALL
 
 MAZE, SESSIONS = 31001, 4
@@ -18,7 +19,7 @@ MAZE, SESSIONS = 31001, 4
 def session(number: int) -> Recipe:
     """Laps that begin at another cell in each session."""
     path = {"circuits": "CCCC", "start": 2 * number}
-    return Recipe(touch_config(MAZE, number, {"maze": SMALL, "path": path}, {}))
+    return Recipe(touch_config(MAZE, number, {"maze": SMALL, "path": path}))
 
 
 @pytest.mark.soak

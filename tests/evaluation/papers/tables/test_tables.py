@@ -220,11 +220,11 @@ def test_a_candidate_claims_the_heading_that_its_shifted_view_shows(turned_deg, 
     write_building(tmp_path / "buildings", "room", np.radians(turned_deg))
     file = tmp_path / "buildings" / "room_odom_gt.csv"
     settings = [f"recording.file={file}", "recall.sector_fov=3.14159"]
-    run = run_recording(load_config(ROOT / "configs" / "building.yaml", settings))
-    claims = closure_claims(run)
+    _, session, run = run_recording(load_config(ROOT / "configs" / "building.yaml", settings))
+    claims = closure_claims(session.map, run.truth)
     assert claims.distance.max() < 0.5
     assert claims.turn.max() < np.radians(1)
-    blind = closure_claims(run._replace(truth=run.truth * [1, 1, 0]))  # the claims themselves
+    blind = closure_claims(session.map, run.truth * [1, 1, 0])  # the claims themselves
     assert np.isclose(blind.turn, np.radians(20), atol=1e-3).sum() > 20
 
 
