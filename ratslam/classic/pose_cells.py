@@ -19,7 +19,7 @@ from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.excitation_inhibition import TIE, ring_difference, rotate
 from ratslam.classic.levels import (
     Activity,
-    Level,
+    Levels,
     StepInput,
     point_activity,
     step_at_smallest_level,
@@ -66,7 +66,7 @@ class PoseCells(NamedTuple):
     settling: Array
 
 
-def start(config: NetworkConfig, dtype: np.dtype, levels: tuple[Level, ...] | None = None) -> PoseCells:
+def start(config: NetworkConfig, dtype: np.dtype, levels: Levels | None = None) -> PoseCells:
     """A single active cell in the middle of the torus; with all window levels, or with those given."""
     pose = jnp.asarray(rings(config, dtype) // 2)
     activity = point_activity(levels or window_levels(config, dtype), pose)
@@ -75,7 +75,7 @@ def start(config: NetworkConfig, dtype: np.dtype, levels: tuple[Level, ...] | No
 
 def step(
     config: NetworkConfig,
-    levels: tuple[Level, ...],
+    levels: Levels,
     cells: PoseCells,
     odometry: Odometry,
     recall: Array,

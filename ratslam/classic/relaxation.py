@@ -32,9 +32,8 @@ def relax(
     """
     # Plain floats: every link depends on the one before, so the loop cannot be vectorised.
     x, y, th = (column.tolist() for column in np.asarray(poses, float).T)
-    links = list(
-        zip(*(np.asarray(column).tolist() for column in (start, end, distance, heading, facing)), strict=True)
-    )
+    columns = (np.asarray(column).tolist() for column in (start, end, distance, heading, facing))
+    links = list(zip(*columns, strict=True))
     for _ in range(loops):
         for a, b, far, aside, turned in links:
             bearing = th[a] + aside

@@ -278,9 +278,8 @@ class Search:
         side = BIN * self.config.cell
         across = int(np.ceil(self._extent / side))
         turn = 2 * np.pi / BINS_AROUND
-        column, row = jnp.clip(
-            jnp.floor((pose[:, :2] + self._extent / 2) / side).astype(jnp.int32), 0, across - 1
-        ).T
+        at = jnp.floor((pose[:, :2] + self._extent / 2) / side).astype(jnp.int32)
+        column, row = jnp.clip(at, 0, across - 1).T
         heading = jnp.floor(pose[:, 2] / turn).astype(jnp.int32) % BINS_AROUND
         index = (row * across + column) * BINS_AROUND + heading
         binned = jnp.zeros(across * across * BINS_AROUND, self.dtype).at[index].add(share)

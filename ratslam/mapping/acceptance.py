@@ -137,16 +137,14 @@ def _log_sum(values: np.ndarray) -> np.ndarray:
     return largest + np.log(np.exp(values - largest[..., None]).sum(axis=-1))
 
 
-def _belief(
-    share: np.ndarray, values: np.ndarray, prior: float, least_sd: float
-) -> tuple[float, float, float]:
+def _belief(share: np.ndarray, values: np.ndarray, prior: float, least: float) -> tuple[float, float, float]:
     """Mean of values [G] with weights [G], shrunk towards the prior's; the mean itself; and the standard
     deviation about the shrunk mean."""
     mean = float(share @ values)
     sd = float(np.sqrt(share @ (values - mean) ** 2))
     off = mean - prior
     kept = prior + (off * max(0.0, 1 - (SHRINK * sd / off) ** 2) if off else 0.0)
-    return kept, mean, max(float(np.hypot(sd, mean - kept)), least_sd)
+    return kept, mean, max(float(np.hypot(sd, mean - kept)), least)
 
 
 _Vote = tuple[np.ndarray, np.ndarray, CalibrationPrior, CalibrationPrior, np.ndarray]

@@ -112,9 +112,8 @@ def select_closures_and_cuts(
         best = min(optimise_with_cuts(case, starts[0], earlier), best, key=lambda found: found.cost)
     while True:
         strain = _strain(case, best)
-        strained = [
-            sequence for sequence in np.argsort(-strain)[:TRIALS].tolist() if strain[sequence] >= MIN_STRAIN
-        ]
+        tried = np.argsort(-strain)[:TRIALS]
+        strained = tried[strain[tried] >= MIN_STRAIN].tolist()
         found = [selection for sequence in strained for selection in _cut(case, best, sequence, find)]
         if not found:
             return best
@@ -152,12 +151,8 @@ def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
 
 def _claim(best: Selection, closures: LoopClosures, frame: int, sequence: int | None = None) -> np.ndarray:
     """[3] pose of a keyframe by its closures alone; without any, its pose in the map."""
-    among = closures.j == frame
-    among &= (
-        (closures.sequence == sequence)
-        if sequence is not None
-        else (best.fit.weights > ACCEPTED_WEIGHT)[closures.sequence]
-    )
+    accepted = (best.fit.weights > ACCEPTED_WEIGHT)[closures.sequence]
+    among = (closures.j == frame) & (accepted if sequence is None else closures.sequence == sequence)
     if not among.any():
         return best.fit.poses[frame]
     member = int(np.flatnonzero(among)[0])

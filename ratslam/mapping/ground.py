@@ -309,10 +309,8 @@ def learn_gain_odds(true: np.ndarray, false: np.ndarray, prior: GainPrior = PRIO
     low, high = np.clip(np.quantile(pooled, [0.005, 0.995]), -FARTHEST, FARTHEST).tolist()
     edges = np.linspace(low, high, BINS - 1)
     same, other = _density(edges, true, prior_true), _density(edges, false, prior_false)
-    mixed_same, mixed_other = (
-        (1 - OUTLIERS) * same + OUTLIERS * other,
-        (1 - OUTLIERS) * other + OUTLIERS * same,
-    )
+    mixed_same = (1 - OUTLIERS) * same + OUTLIERS * other
+    mixed_other = (1 - OUTLIERS) * other + OUTLIERS * same
     tiny = np.finfo(float).tiny  # a bin without counts has no odds
     raw = np.log((mixed_same + tiny) / (mixed_other + tiny))
     # A better fit is never evidence against a place; bins without gains say little.
@@ -352,9 +350,7 @@ class LearnedOdds(Checkpointed):
             row = int(known[0])
             return GainOdds(self.edges.rows[row], self.odds.rows[row], float(self.expected.rows[row]))
         found = learn()
-        self.ground.append(ground)
-        for array, values in zip((self.edges, self.odds, self.expected), found, strict=True):
-            array.append(values)
+        self._append_row(ground, *found)
         return found
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -364,8 +360,7 @@ class LearnedOdds(Checkpointed):
         if arrays:
             super().restore(arrays)
         else:
-            for array in (self.ground, self.edges, self.odds, self.expected):
-                array.replace(array.rows[:0])
+            self._take_rows(slice(0))
 
 
 COMMON = 0.5

@@ -298,9 +298,8 @@ class ClosureLog(Checkpointed):
 
     def judged(self) -> np.ndarray:
         """[n, 3] match, keyframe, and 1 where accepted, 0 where open, -1 where removed, of all candidates."""
-        sign = np.where(
-            self._candidate.rows[:, 3] < 0, -1, SIGNS[self._verdict.rows[self._candidate.rows[:, 3]]]
-        )
+        sequence = self._candidate.rows[:, 3]
+        sign = np.where(sequence < 0, -1, SIGNS[self._verdict.rows[sequence]])
         return np.column_stack([self._candidate.rows[:, 1::-1], sign])
 
     def accepted_middle_first(self) -> np.ndarray:

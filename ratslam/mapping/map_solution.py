@@ -357,9 +357,7 @@ def health_features(graph: KeyframeGraph, solution: MapSolution) -> np.ndarray:
     sums = np.cumsum((error**2 / chain.variance).sum(axis=1))
     window = sums[WINDOW:] - sums[:-WINDOW] if len(sums) > WINDOW else sums[-1:]
     strain = float(np.log10(max(window.max(initial=0.0), 0.0) + 1e-6))
-    unexplained, before = (
-        _unexplained(solution.log, each, graph.sector_angle, graph.cell) for each in (poses, reckoned)
-    )
+    unexplained, before = (_unexplained(graph, solution.log, each) for each in (poses, reckoned))
     return np.array([of_map - of_odometry, of_odometry, strain, strain * of_odometry, unexplained - before])
 
 
@@ -372,7 +370,7 @@ def _claims_ratio(graph: KeyframeGraph, poses: np.ndarray) -> float:
     return float(np.log((agreed + LEAST_CLAIMS) / (contradicted + LEAST_CLAIMS)))
 
 
-def _unexplained(log: ClosureLog, poses: np.ndarray, angle: float, cell: float) -> float:
+def _unexplained(graph: KeyframeGraph, log: ClosureLog, poses: np.ndarray) -> float:
     """Share of the evidence of refused sequences that poses [N, 3] do not explain."""
     table = log.table()
     table = table[table[:, 5] >= 0]
@@ -383,7 +381,8 @@ def _unexplained(log: ClosureLog, poses: np.ndarray, angle: float, cell: float) 
     worth = worth * np.maximum(table[:, 4], 0.0)
     j, i = table[:, :2].astype(int).T
     error = between(poses[i], poses[j])
-    error[:, 2] = wrap(error[:, 2] + table[:, 2] * angle)
-    apart = (error[:, 0] ** 2 + error[:, 1] ** 2) / (PLACE * cell) ** 2 + (error[:, 2] / HEADING) ** 2
+    error[:, 2] = wrap(error[:, 2] + table[:, 2] * graph.sector_angle)
+    far, turned = error[:, 0] ** 2 + error[:, 1] ** 2, error[:, 2] / HEADING
+    apart = far / (PLACE * graph.cell) ** 2 + turned**2
     lost = (worth * apart / (1 + apart)).sum()
     return float((lost + NEUTRAL / 2) / (worth.sum() + NEUTRAL))

@@ -150,14 +150,8 @@ def merge_keyframes(graph: KeyframeGraph, merge: Merge) -> None:
     mean = reference + _summed(group, information * off, len(pairs)) / total
     mean[:, 2] = wrap(mean[:, 2])
     by_heading = information[:, 2] / total[group, 2]
-    links = OdometryLinks(
-        pairs // size,
-        pairs % size,
-        mean,
-        np.bincount(group, by_heading * length[apart], len(pairs)),
-        np.bincount(group, by_heading * turn[apart], len(pairs)),
-        1 / total,
-    )
+    length, turn = (np.bincount(group, by_heading * each[apart], len(pairs)) for each in (length, turn))
+    links = OdometryLinks(pairs // size, pairs % size, mean, length, turn, 1 / total)
     skipped = take_keyframes(graph, merge.kept)
     graph.seam.rows[skipped] = True
     graph.links = links

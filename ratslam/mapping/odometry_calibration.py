@@ -291,9 +291,8 @@ def learn_heading_noise(
     off = noise.log_factor - start.log_factor
     system = System(problem)
     changed = [system.with_problem(problem.with_heading_noise(float(np.exp(step)))) for step in steps]
-    logs = np.array(
-        [log_posterior(off + step, at.solve(fit, STEPS), at) for step, at in zip(steps, changed, strict=True)]
-    )
+    pairs = zip(steps, changed, strict=True)
+    logs = np.array([log_posterior(off + step, at.solve(fit, STEPS), at) for step, at in pairs])
     if not np.isfinite(logs).all():
         return noise
     slope = (logs[2] - logs[0]) / (2 * LARGEST_STEP)

@@ -224,9 +224,8 @@ class MapCovariance:
             right[at] += by.T
         spread, none = factor.solve(right), np.zeros((3, 3))
         pull = sum((by @ self._bent[at] for at, by in free), none[:, : len(self._calibrated)])
-        return sum((by @ spread[at] for at, by in free), none) + pull @ np.linalg.solve(
-            self._calibrated, pull.T
-        )
+        shared = pull @ np.linalg.solve(self._calibrated, pull.T)
+        return sum((by @ spread[at] for at, by in free), none) + shared
 
 
 class System:
@@ -324,21 +323,14 @@ class System:
         poses = np.ascontiguousarray(fit.poses)
         measured, error, chi2 = self._errors(fit)
         trust, weights, _ = weigh_closures(chi2, *self._closures)
-        n, blocks, parameters = self._pattern.count, len(self._pattern.row), self._parameters
-        diagonal, above, right = (
-            np.zeros(shape) for shape in ((n, 3, 3), (blocks, 3, 3), (n, 3, 1 + parameters))
-        )
+        pattern, parameters = self._pattern, self._parameters
+        shapes = (pattern.count, 3, 3), (len(pattern.row), 3, 3), (pattern.count, 3, 1 + parameters)
+        diagonal, above, right = (np.zeros(shape) for shape in shapes)
         corner, slope = np.zeros((parameters, parameters)), np.zeros(parameters)
         add_measurements(self._edges, poses, measured, error, trust, (diagonal, above, right, corner, slope))
         off, tight = _calibration(fit, self._problem.prior)
-        return Equations(
-            self._pattern.factorise(diagonal, above),
-            self._pattern.place,
-            right,
-            corner + np.diag(tight),
-            slope + tight * off,
-            weights,
-        )
+        factor, corner = pattern.factorise(diagonal, above), corner + np.diag(tight)
+        return Equations(factor, pattern.place, right, corner, slope + tight * off, weights)
 
     def _errors(self, fit: MapFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `measurement_errors`."""

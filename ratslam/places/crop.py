@@ -78,13 +78,9 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
     views = map.appearance.stored(taken)
     map.appearance.take(taken)
     motion, length, turn = (own[f"travel/{k}"] for k in range(3))
-    arrays |= {
-        "travel/0": compose(since.motion, motion),
-        "travel/1": np.array(since.length + length),
-        "travel/2": np.array(since.turn + turn),
-        "solved/0": np.array(-1),
-        "solved/1": np.array(-1),
-    }
+    travel = compose(since.motion, motion), since.length + length, since.turn + turn
+    arrays |= {f"travel/{k}": np.array(value) for k, value in enumerate(travel)}
+    arrays |= {"solved/0": np.array(-1), "solved/1": np.array(-1)}
     parts = (
         ("graph/", graph), ("log/", log), ("steps/", steps), ("experiences/", experiences),
         ("appearance/", map.appearance),

@@ -157,15 +157,11 @@ class SessionViews(Checkpointed):
         if self.count >= 2 * SPAN:
             self.forget(SPAN)
         empty = np.zeros(self.gain.rows.shape[1:], np.float32)
-        self.gain.append(empty if gain is None else gain)
-        self.shows.append(gain is not None)
-        self.motion.append(moved.motion)
-        self.variance.append(moved.variance)
+        self._append_row(empty if gain is None else gain, gain is not None, *moved)
 
     def forget(self, keep: int) -> None:
         """Forgets all but the newest keyframes."""
-        for array in self._growable_arrays().values():
-            array.replace(array.rows[max(len(array.rows) - keep, 0) :].copy())
+        self._take_rows(slice(max(self.count - keep, 0), None))
 
     def moved(self, k: int) -> Motion:
         """The odometry into keyframe k."""
@@ -237,7 +233,7 @@ class Hypotheses(Checkpointed):
             if likely and not same_pose(ground, self.pose.rows[kept], self.pose.rows[k]).any():
                 kept.append(k)
         if len(kept) < self.count:
-            self._keep(np.isin(np.arange(self.count), kept))
+            self._take_rows(np.isin(np.arange(self.count), kept))
 
     def propose(self, ground: Ground, odds: GainOdds, views: SessionViews, pose: np.ndarray) -> None:
         """Adds a pose hypothesis [3] of the newest keyframe, with the log-odds of its own way back to the
@@ -268,16 +264,11 @@ class Hypotheses(Checkpointed):
         are too low."""
         if log_odds < MIN_LOG_ODDS:
             return
-        self.pose.append(at.pose)
-        self.covariance.append(at.covariance)
-        self.log_odds.append(log_odds)
-        self.states.append(NOTHING_CHANGED)
-        self.best.append(0.0)
-        self.inside.append(True)
+        self._append_row(*at, log_odds, NOTHING_CHANGED, 0.0, True)
 
     def clear(self) -> None:
         """Drops all."""
-        self._keep(np.zeros(self.count, bool))
+        self._take_rows(slice(0))
 
     def fall(self, k: int) -> float:
         """By how much the log-odds of a pose hypothesis are below their best, changed ground allowed for."""
@@ -286,10 +277,6 @@ class Hypotheses(Checkpointed):
     def ranked(self) -> np.ndarray:
         """[h] the hypotheses by descending log-odds."""
         return np.argsort(-self.log_odds.rows, kind="stable")
-
-    def _keep(self, rows: np.ndarray) -> None:
-        for array in self._growable_arrays().values():
-            array.replace(array.rows[rows].copy())
 
 
 def same_pose(ground: Ground, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -92,9 +92,7 @@ class Localiser(Checkpointed, Map):
             until views contradict it. None: unknown.
     """
 
-    VALUES = (
-        "_travel", "_state", "_recalled", "_newest", "_covariance", "_mass", "_log_odds",
-    )  # fmt: skip
+    VALUES = ("_travel", "_state", "_recalled", "_newest", "_covariance", "_mass", "_log_odds")
     PARTS = ("_views", "_hypotheses")
 
     def __init__(self, place: Place, log_odds: float, start: np.ndarray | None = None) -> None:

@@ -171,10 +171,8 @@ class MapViews:
     def look(self, memory: Memory, belief: Belief, view: Array, label: Array) -> tuple[Memory, Belief, Look]:
         """Recalls one view in its stored form, and compares it with all keyframes."""
         memory, likelihood = self.recall.likelihood(self.config, memory, view, label)
-        motion = memory.corrected_motion()
-        belief, result = filter.recognise(
-            self.config, self.recall.network, memory, belief, motion, likelihood, 0.0
-        )
+        motion, network = memory.corrected_motion(), self.recall.network
+        belief, result = filter.recognise(self.config, network, memory, belief, motion, likelihood, 0.0)
         zero = jnp.zeros_like(memory.length)
         memory = memory._replace(motion=jnp.zeros_like(memory.motion), length=zero, turn=zero)
         shows = likelihood.certain & likelihood.informative
@@ -198,9 +196,8 @@ class MapViews:
 
         def look(state: tuple[Memory, Belief], one: tuple[Array, ...]) -> tuple[tuple[Memory, Belief], Look]:
             (memory, belief), (view, label, motion, real) = state, one
-            moved = memory._replace(
-                motion=motion, length=jnp.hypot(motion[0], motion[1]), turn=jnp.abs(motion[2])
-            )
+            length = jnp.hypot(motion[0], motion[1])
+            moved = memory._replace(motion=motion, length=length, turn=jnp.abs(motion[2]))
             memory, belief, found = lax.cond(
                 real,
                 lambda: self.look(moved, belief, view, label),

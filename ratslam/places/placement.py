@@ -105,9 +105,8 @@ class Traverse(NamedTuple):
         before = follow(ground, odds, at, back, self.least)
         onwards = ((motions[i], views.gains(i)) for i in range(k + 1, len(motions)))
         after = follow(ground, odds, at, onwards, self.least)
-        poses, gained = (
-            np.concatenate([one[:0:-1], other]) for one, other in zip(before[:2], after[:2], strict=True)
-        )
+        parts = zip(before[:2], after[:2], strict=True)
+        poses, gained = (np.concatenate([one[:0:-1], other]) for one, other in parts)
         path = Path(poses, gained, k + 1 - len(before.poses))
         if self.solved is not None:
             confirmed = np.flatnonzero(path.odds > 0)

@@ -138,10 +138,8 @@ class Memory(NamedTuple):
     def pose_spread(self, config: RecallConfig, cell: float) -> tuple[Array, Array]:
         """Standard deviation of the current pose: position, m, and heading, rad."""
         since = self.since + self.length
-        return (
-            config.local_sd * cell + config.local_rate * since,
-            config.local_heading + config.local_heading_rate / cell * since,
-        )
+        position = config.local_sd * cell + config.local_rate * since
+        return position, config.local_heading + config.local_heading_rate / cell * since
 
     def store_keyframe(self, view: Array, label: Array) -> Memory:
         """Stores the newest view as a keyframe at the robot's current pose.
@@ -239,14 +237,13 @@ class Memory(NamedTuple):
             former = np.asarray(rows)
             return _put(former[..., merged.source], rows) if former.size else jnp.array(former)
 
+        taken = ("x", "y", "heading", "cosine", "sine", "before")
         return self._replace(
             view=_put(merged.view.T, self.view),
             label=_put(merged.label, self.label, -1),
-            x=take(self.x), y=take(self.y), heading=take(self.heading),
-            cosine=take(self.cosine), sine=take(self.sine),
-            before=take(self.before),
             count=jnp.array(count, jnp.int32),
-        )  # fmt: skip
+            **{name: take(getattr(self, name)) for name in taken},
+        )
 
     def crop_rows(self, cropped: CroppedRows) -> Memory:
         """The memory reduced to rows."""

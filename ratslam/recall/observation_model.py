@@ -155,10 +155,8 @@ def label_gains(distinct: int) -> tuple[float, float]:
     Args:
         distinct: number of known ids.
     """
-    same, other = (
-        LABELS["same"] * max(distinct, 1) / LABELS["new_known"],
-        LABELS["other"] / LABELS["new_known"],
-    )
+    same, other = LABELS["same"] * max(distinct, 1), LABELS["other"]
+    same, other = same / LABELS["new_known"], other / LABELS["new_known"]
     return LABEL_TEMPER * float(np.log(same)), LABEL_TEMPER * float(np.log(other))
 
 
@@ -184,8 +182,7 @@ def _background(error: Array, away: Array) -> Array:
     rank = jnp.cumsum(away.astype(jnp.int32))
     count = rank[-1]
     ranks = (jnp.arange(SAMPLES, dtype=jnp.int32) * jnp.maximum(count - 1, 0)) // (SAMPLES - 1) + 1
-    row = jnp.searchsorted(rank, ranks)
-    row = jnp.minimum(row, len(rank) - 1)
+    row = jnp.minimum(jnp.searchsorted(rank, ranks), len(rank) - 1)
     # With fewer than SAMPLES keyframes each is reported once.
     fresh = jnp.concatenate([jnp.ones(1, bool), row[1:] != row[:-1]])
     return jnp.where(fresh & (count > 0), error[row], jnp.nan)
