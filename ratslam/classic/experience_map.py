@@ -276,17 +276,13 @@ class ExperienceMap(Checkpointed, Map):
             poses, edges, scale = self._pose.rows, self.edges(), solver.scale
             kernels = {"none": no_kernel, "huber": huber(scale), "geman_mcclure": geman_mcclure(scale**2)}
             self._growing = growing_equations(len(poses), edges, self._growing)
-            solution = least_squares(
-                poses, edges, kernel=kernels[solver.kernel], robust=self._closure.rows,
-                equations=self._growing,
-            )  # fmt: skip
+            kernel, robust = kernels[solver.kernel], self._closure.rows
+            solution = least_squares(poses, edges, kernel=kernel, robust=robust, equations=self._growing)
             self._pose.rows[:] = solution.poses
         elif isinstance(solver, Relaxation) and len(self._ends.rows):
-            ends, motion = self._ends.rows, self._motion.rows
-            self._pose.rows[:] = relax(
-                self._pose.rows, ends[:, 0], ends[:, 1], np.hypot(motion[:, 0], motion[:, 1]),
-                np.arctan2(motion[:, 1], motion[:, 0]), motion[:, 2], solver.loops, solver.correction,
-            )  # fmt: skip
+            x, y, turn = self._motion.rows.T
+            links = (*self._ends.rows.T, np.hypot(x, y), np.arctan2(y, x), turn)
+            self._pose.rows[:] = relax(self._pose.rows, links, solver.loops, solver.correction)
 
     def _origin(self) -> np.ndarray:
         return self._pose.rows[self._current] if self._current >= 0 else np.zeros(3)

@@ -74,12 +74,7 @@ def start(config: NetworkConfig, dtype: np.dtype, levels: Levels | None = None) 
 
 
 def step(
-    config: NetworkConfig,
-    levels: Levels,
-    cells: PoseCells,
-    odometry: Odometry,
-    recall: Array,
-    energy: Array,
+    config: NetworkConfig, levels: Levels, cells: PoseCells, odometry: Odometry, recall: Array, energy: Array
 ) -> tuple[PoseCells, tuple[Array, Array, Array]]:
     """One step of the network.
 

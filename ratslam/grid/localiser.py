@@ -67,10 +67,8 @@ class GridLocaliser(Checkpointed, Map):
 
     def localisation(self) -> LocalisedPose:
         """The robot's pose now, and whether it is known."""
-        return LocalisedPose(
-            Localisation(self._state), self._now_pose, self._now_covariance, self._now_mass,
-            self._now_log_odds,
-        )  # fmt: skip
+        state = Localisation(self._state)
+        return LocalisedPose(state, self._now_pose, self._now_covariance, self._now_mass, self._now_log_odds)
 
     def pose(self, estimate: Estimate) -> np.ndarray:
         del estimate

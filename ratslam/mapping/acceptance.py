@@ -95,16 +95,12 @@ LEAST_TURN_ERROR = 0.002
 
 
 def vote(
-    grid: np.ndarray,
-    prior: CalibrationPrior,
-    log_ratios: np.ndarray,
-    score_odds: np.ndarray,
-    least_bias_sd: float,
+    grid: np.ndarray, prior: CalibrationPrior, log_ratios: np.ndarray, score_odds: np.ndarray, least_sd: float
 ) -> tuple[CalibrationPrior, CalibrationPrior, np.ndarray]:
     """The vote of R sequences on the calibrations of `grid` [G, 2], rad/m and rad/rad.
 
     Args:
-        log_ratios: [R, G] of `OdometryScan`. score_odds: [R] log odds by their scores. least_bias_sd: least
+        log_ratios: [R, G] of `OdometryScan`. score_odds: [R] log odds by their scores. least_sd: least
             standard deviation of the belief in the bias, rad/m.
 
     Returns:
@@ -120,14 +116,12 @@ def vote(
     others = total - votes
     others = others - _log_sum(others)[:, None]
     share = np.exp(total - _log_sum(total))
-    bias, bias_mean, bias_sd = _belief(share, grid[:, 0], prior.bias, least_bias_sd)
+    bias, bias_mean, bias_sd = _belief(share, grid[:, 0], prior.bias, least_sd)
     turn, turn_mean, turn_sd = _belief(share, grid[:, 1], prior.turn_error, LEAST_TURN_ERROR)
     turn_sd = turn_sd if prior.turn_error_sd > 0 else 0.0
-    return (
-        CalibrationPrior(bias, bias_sd, turn, turn_sd),
-        CalibrationPrior(bias_mean, bias_sd, turn_mean, turn_sd),
-        score_odds + _log_sum(others + log_ratios),
-    )
+    belief = CalibrationPrior(bias, bias_sd, turn, turn_sd)
+    mean = CalibrationPrior(bias_mean, bias_sd, turn_mean, turn_sd)
+    return belief, mean, score_odds + _log_sum(others + log_ratios)
 
 
 def _log_sum(values: np.ndarray) -> np.ndarray:

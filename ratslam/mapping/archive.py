@@ -181,11 +181,8 @@ class UnmergedMap(Checkpointed):
         graph.heading_noise = selected.noise
         rest = np.arange(size, count)
         number = np.arange(len(self.kept), len(self.kept) + len(rest))
-        return Merge(
-            np.concatenate([self.kept, rest]),
-            np.concatenate([self.onto, number]),
-            np.concatenate([self.offset, np.zeros((len(rest), 3))]),
-        )
+        kept, onto = np.concatenate([self.kept, rest]), np.concatenate([self.onto, number])
+        return Merge(kept, onto, np.concatenate([self.offset, np.zeros((len(rest), 3))]))
 
 
 class _ArchiveSelection(Checkpointed):

@@ -27,7 +27,7 @@ from scipy.special import expit
 
 from ratslam.core.arrays import GrowableArray
 from ratslam.core.compiled import compiled
-from ratslam.mapping.ground import DEVIATIONS, MOST_REACH, MOST_REACH_HEADING, REACH, REACH_HEADING
+from ratslam.mapping.ground import MOST_REACH, MOST_REACH_HEADING, REACH, REACH_HEADING, grown_reaches
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
 from ratslam.mapping.odometry_scan import log_ratio
@@ -371,8 +371,7 @@ def _follow(
                 _move(pose, motion[row], onwards)
                 place += variance[row, 0] + heading * (motion[row, 0] ** 2 + motion[row, 1] ** 2)
                 heading += variance[row, 2]
-            far = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
-            turn = min(reach_heading + DEVIATIONS * np.sqrt(heading), MOST_REACH_HEADING * reach_heading)
+            far, turn = grown_reaches(reach, reach_heading, place, heading)
             best, off, on_way = _compare_view(pose, near, frame, far, turn, (reach / 2, reach_heading / 2))
             seen = pose.copy()
             if best > 0:  # Kalman update, position and heading apart

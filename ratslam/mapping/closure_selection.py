@@ -58,13 +58,16 @@ class SelectionProblem(NamedTuple):
     place: Place = np.copy
 
 
+Cuts = tuple[tuple[int, int], ...]
+"""Of the odometry: the keyframe after each cut, and the sequence that shows it."""
+
+
 class Selection(NamedTuple):
-    """The best map found: its fit with a weight for each sequence, its cost (chi-square), and the cuts of
-    the odometry: (keyframe after the cut, sequence that shows it)."""
+    """The best map found: its fit with a weight for each sequence, its cost (chi-square), and its cuts."""
 
     fit: MapFit
     cost: float
-    cuts: tuple[tuple[int, int], ...]
+    cuts: Cuts
 
 
 FindCut = Callable[[np.ndarray, np.ndarray, np.ndarray, int], int]
@@ -91,7 +94,7 @@ def select_closures(case: SelectionProblem, starts: Sequence[MapFit]) -> Selecti
 
 
 def select_closures_and_cuts(
-    case: SelectionProblem, starts: Sequence[MapFit], find: FindCut, earlier: tuple[tuple[int, int], ...] = ()
+    case: SelectionProblem, starts: Sequence[MapFit], find: FindCut, earlier: Cuts = ()
 ) -> Selection:
     """The selection with the least cost for a robot that may be carried: with cuts of the odometry.
 
@@ -210,14 +213,12 @@ def _carry(
     return frame, moved
 
 
-def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: tuple[tuple[int, int], ...]) -> Selection:
+def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: Cuts) -> Selection:
     """The fit and its cost with these cuts (keyframe, sequence), from the poses and bias of `start`."""
     return _optimise(case, System(case.measurements.cut_at([frame for frame, _ in cuts])), start, cuts)
 
 
-def _optimise(
-    case: SelectionProblem, system: System, start: MapFit, cuts: tuple[tuple[int, int], ...]
-) -> Selection:
+def _optimise(case: SelectionProblem, system: System, start: MapFit, cuts: Cuts) -> Selection:
     fit = system.solve(start, STEPS, FINE)
     cost = system.robust_cost(fit) + case.views_cost(fit.poses)
     return Selection(fit, cost + CUT * len(cuts), cuts)
@@ -282,11 +283,8 @@ class MapHypotheses(Checkpointed):
         self.poses = self.poses[:, merge.kept[merge.kept < self.poses.shape[1]]]
 
     def _fits(self, count: int) -> list[MapFit]:
-        weights = np.ones(count)
-        return [
-            MapFit(poses, bias, weights, turn_error)
-            for poses, (bias, turn_error) in zip(self.poses, self._calibration.tolist(), strict=True)
-        ]
+        weights, maps = np.ones(count), zip(self.poses, self._calibration.tolist(), strict=True)
+        return [MapFit(poses, bias, weights, turn_error) for poses, (bias, turn_error) in maps]
 
 
 def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: int) -> list[MapFit]:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
-from ratslam.recall.config import RecallConfig, sector_shifts
+from ratslam.core.compiled import compiled
 from tactile.base.se2 import compose, inverse, wrap
 
 REACH = 1.2
@@ -56,6 +56,19 @@ class Ground(NamedTuple):
     reach_heading: float
     variance: np.ndarray
     near_share: float = NEAR
+
+    @classmethod
+    def of(
+        cls, poses: np.ndarray, shift: np.ndarray, cell: float, turn: float, variance: np.ndarray, near: float
+    ) -> Ground:
+        """Keyframes at these poses [N, 3] as ground.
+
+        Args:
+            shift: [S] sector shifts. cell: size of a pose cell, m. turn: per sector shift, rad. near:
+                `near_share`.
+        """
+        turns, least = -shift * turn, 0.6 * abs(turn) if len(shift) > 2 else 0.0
+        return cls(poses, turns, REACH * cell, max(REACH_HEADING, least), variance, near)
 
     def near(self, pose: np.ndarray, reach: float, reach_heading: float) -> tuple[np.ndarray, np.ndarray]:
         """The sector shifts [n] and keyframes [n] at which a robot at `pose` [3] is compared.
@@ -113,25 +126,6 @@ class Ground(NamedTuple):
         """Number of poses that can be told apart: keyframes within reach of each other count as one."""
         density = [len(self.near(pose, self.reach, self.reach_heading)[0]) for pose in self.poses]
         return float((len(self.turns) / np.maximum(density, 1)).sum())
-
-
-def ground_of(
-    poses: np.ndarray,
-    recall: RecallConfig,
-    cell: float,
-    sector_angle: float,
-    variance: np.ndarray,
-    near_share: float = NEAR,
-) -> Ground:
-    """Keyframes at these poses [N, 3] as ground.
-
-    Args:
-        cell: size of a pose cell, m. sector_angle: turn per sector shift, rad.
-        variance, near_share: see `Ground`.
-    """
-    turns = -sector_shifts(recall) * sector_angle
-    least = 0.6 * abs(sector_angle) if len(turns) > 2 else 0.0
-    return Ground(poses, turns, REACH * cell, max(REACH_HEADING, least), variance, near_share)
 
 
 DEVIATIONS = 2.0
@@ -252,6 +246,14 @@ def advance_all(
         corrected, _ = advance(ground, PoseHypothesis(at.pose[k], at.covariance[k]), moved, gain)
         pose[k], covariance[k] = corrected
     return PoseHypothesis(pose, covariance), best
+
+
+@compiled
+def grown_reaches(reach: float, reach_heading: float, place: float, heading: float) -> tuple[float, float]:
+    """The reaches, m and rad, of a pose with these variances of position and heading, from those of the
+    ground; for compiled loops."""
+    far = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
+    return far, min(reach_heading + DEVIATIONS * np.sqrt(heading), MOST_REACH_HEADING * reach_heading)
 
 
 def _reaches(ground: Ground, position: Any, heading: Any) -> tuple[Any, Any]:

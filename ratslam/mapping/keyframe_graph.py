@@ -336,12 +336,10 @@ class KeyframeGraph(Checkpointed):
         zero = np.zeros(len(closures.i))
         turned = np.stack([zero, zero, closures.turn], axis=1)
         trust = log.weights()[:, None] / closures.variance
-        return Edges(
-            np.concatenate([steps, links.i, closures.i]),
-            np.concatenate([steps + 1, links.j, closures.j]),
-            np.concatenate([moved[steps], fit.corrected_links(links), turned]),
-            np.concatenate([1 / chain.variance[steps], 1 / links.variance, trust]),
-        )
+        i = np.concatenate([steps, links.i, closures.i])
+        j = np.concatenate([steps + 1, links.j, closures.j])
+        motion = np.concatenate([moved[steps], fit.corrected_links(links), turned])
+        return Edges(i, j, motion, np.concatenate([1 / chain.variance[steps], 1 / links.variance, trust]))
 
     def _loose_variance(self) -> np.ndarray:
         return np.array([LOOSE * self.cell, LOOSE * self.cell, LOOSE]) ** 2

@@ -313,13 +313,11 @@ class ClosureLog(Checkpointed):
         ordered: np.ndarray = rows[order][np.argsort(off, kind="stable")]
         return ordered
 
-    def closures(
-        self, angle: float, variance: np.ndarray, scales: tuple[float, float, float]
-    ) -> LoopClosures:
+    def closures(self, angle: float, variance: np.ndarray, scale: tuple[float, float, float]) -> LoopClosures:
         """The accepted closures, for the optimiser.
 
         Args:
-            angle: turn per sector shift, rad. variance: [3] of a closure. scales: robust scale per unit of
+            angle: turn per sector shift, rad. variance: [3] of a closure. scale: robust scale per unit of
                 a sequence's evidence, least scale, largest scale.
         """
         rows = self._candidate.rows[self.accepted_rows()]
@@ -332,7 +330,7 @@ class ClosureLog(Checkpointed):
             turn=-rows[:, 2] * angle,
             sequence=sequence,
             variance=variance,
-            scale=np.clip(scales[0] * score, *scales[1:]),
+            scale=np.clip(scale[0] * score, *scale[1:]),
             score=score + merged[:, 0],
             size=np.bincount(sequence, minlength=len(sequences)) + merged[:, 1],
             credit=self.credit()[sequences],

@@ -204,18 +204,13 @@ class Hypotheses(Checkpointed):
         return PoseHypothesis(self.pose.rows[k], self.covariance.rows[k])
 
     def advance(
-        self,
-        ground: Ground,
-        odds: GainOdds,
-        moved: Motion,
-        gain: np.ndarray | None,
-        recalled: Recalled | None = None,
+        self, ground: Ground, odds: GainOdds, step: Motion, gain: np.ndarray | None, recalled: Recalled | None
     ) -> None:
         """Moves all hypotheses to the newest keyframe; drops unlikely ones, and the weaker of two that
         have become one."""
         log_odds = np.zeros(self.count)
         for k in range(self.count):
-            at, gained = advance(ground, self.at(k), moved, gain)
+            at, gained = advance(ground, self.at(k), step, gain)
             log_odds[k], inside = keyframe_odds(ground, odds, at.pose, gained, bool(self.inside.rows[k]))
             self.pose.rows[k], self.covariance.rows[k] = at
             self.inside.rows[k] = inside

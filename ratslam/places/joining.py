@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.mapping.closure_selection import MapHypotheses
-from ratslam.mapping.ground import Ground, Motion
+from ratslam.mapping.ground import MAP_WEIGHTING, Ground, Motion
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, Verdict
 from ratslam.mapping.map import KeyframeMap
@@ -170,11 +170,9 @@ def _join(map: KeyframeMap, views: MapViews, one: np.ndarray, other: np.ndarray)
     joined = np.where((piece[1:] != piece[:-1])[:, None], 1.0, problem.chain.variance)
     problem = problem._replace(chain=problem.chain._replace(variance=joined))
     covariance = MapCovariance(graph.fit(), problem).relative(middle.match, middle.keyframe, 0.0)
-    return Join(
-        ((), ()), start, np.sqrt(np.diag(covariance)),
-        (found.log_odds, back.log_odds), (found.needed, back.needed),
-        sum(len(sequence) for sequence in sequences),
-    )  # fmt: skip
+    log_odds, needed = (found.log_odds, back.log_odds), (found.needed, back.needed)
+    count = sum(len(sequence) for sequence in sequences)
+    return Join(((), ()), start, np.sqrt(np.diag(covariance)), log_odds, needed, count)
 
 
 def _place(map: KeyframeMap, views: MapViews, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
@@ -184,7 +182,7 @@ def _place(map: KeyframeMap, views: MapViews, onto: np.ndarray, frames: np.ndarr
     own = graph.pose.rows[frames]
     every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else graph.taken.rows[onto]
     poses = archive.poses(graph.pose.rows)[every]
-    ground, odds = views.ground(poses), views.odds(every, poses)
+    ground, odds = views.ground(poses), views.odds(every, poses, MAP_WEIGHTING)
     motions = _motions(graph, own)
     session = Traverse(_compare(graph, views, every, poses, frames), motions, MIN_LOG_ODDS, own)
     paths = []

@@ -17,7 +17,6 @@ from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.core.backend import Evidence, Map
 from ratslam.core.estimates import Estimate, Localisation, LocalisedPose, pieces_of, write_course
 from ratslam.mapping.ground import (
-    MAP_WEIGHTING,
     NO_MOTION,
     SESSION_WEIGHTING,
     GainOdds,
@@ -305,17 +304,13 @@ def _follow(
 
 
 def compare_with_itself(
-    ground: Ground,
-    guard: int,
-    gains: Gains,
-    held: np.ndarray | None = None,
-    weighing: GainWeighting = MAP_WEIGHTING,
+    ground: Ground, guard: int, gains: Gains, weighing: GainWeighting, held: np.ndarray | None = None
 ) -> GainOdds:
     """The log-odds of gains on this ground.
 
     Args:
-        guard: number of keyframes before a stretch that do not count as ground. held: [N] bool, the keyframes
-            that are ground for a session; None: all. weighing: of the gains.
+        guard: number of keyframes before a stretch that do not count as ground. weighing: of the gains.
+            held: [N] bool, the keyframes that are ground for a session; None: all.
     """
     count = len(ground.poses)
     held = np.ones(count, bool) if held is None else held

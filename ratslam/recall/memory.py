@@ -261,11 +261,9 @@ class Memory(NamedTuple):
         Args:
             odometry: [3] of one step, m, m, rad.
         """
-        return self._replace(
-            motion=compose(self.motion, odometry),
-            length=self.length + jnp.hypot(odometry[0], odometry[1]),
-            turn=self.turn + jnp.abs(odometry[2]),
-        )
+        length = self.length + jnp.hypot(odometry[0], odometry[1])
+        turn = self.turn + jnp.abs(odometry[2])
+        return self._replace(motion=compose(self.motion, odometry), length=length, turn=turn)
 
     def is_motion_due(self, config: RecallConfig, cell: float) -> Array:
         """bool: the robot has moved so far since the newest keyframe that a view is compared again.
