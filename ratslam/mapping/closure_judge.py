@@ -99,7 +99,7 @@ def judge_sequences(
     """
     if not graph.appearance.JUDGED or graph.config.may_be_carried:
         return np.full(len(sequences), np.nan)
-    return sequence_evidence(graph, fit, log, cut, sequences).log_odds(shipped_weights())
+    return sequence_evidence(graph, fit, log, cut, sequences, BEYOND).log_odds(shipped_weights())
 
 
 def judge_anew(graph: KeyframeGraph, log: ClosureLog, sequences: np.ndarray) -> None:
@@ -118,12 +118,7 @@ def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: G
 
 
 def sequence_evidence(
-    graph: KeyframeGraph,
-    fit: MapFit,
-    log: ClosureLog,
-    cut: GrowableArray,
-    sequences: np.ndarray,
-    after: int = BEYOND,
+    graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, after: int
 ) -> SequenceEvidence:
     """The evidence for sequences [n], each with a candidate or more, in a map of N keyframes.
 

@@ -351,10 +351,7 @@ def health_features(graph: KeyframeGraph, solution: MapSolution) -> np.ndarray:
     reckoned = graph.dead_reckoned()
     of_map = _claims_ratio(graph, solution.fit.poses)
     of_odometry = _claims_ratio(graph, reckoned)
-    chain, poses = graph.odometry(solution.cut), solution.fit.poses
-    error = between(poses[:-1], poses[1:]) - solution.fit.corrected(chain)
-    error[:, 2] = wrap(error[:, 2])
-    sums = np.cumsum((error**2 / chain.variance).sum(axis=1))
+    sums, poses = np.cumsum(solution.fit.strain(graph.odometry(solution.cut))), solution.fit.poses
     window = sums[WINDOW:] - sums[:-WINDOW] if len(sums) > WINDOW else sums[-1:]
     strain = float(np.log10(max(window.max(initial=0.0), 0.0) + 1e-6))
     unexplained, before = (_unexplained(graph, solution.log, each) for each in (poses, reckoned))

@@ -101,10 +101,7 @@ def _confirmed_ground(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
     sure &= ~broken
     sure[:-1] &= ~broken[1:]
     # Odometry from one keyframe to the next that is strained, or near such; never at seams, which are loose.
-    fit, chain = graph.fit(), graph.odometry(graph.cut)
-    error = between(fit.poses[:-1], fit.poses[1:]) - fit.corrected(chain)
-    error[:, 2] = wrap(error[:, 2])
-    tense = (error**2 / chain.variance).sum(axis=1) > TENSE
+    tense = graph.fit().strain(graph.odometry(graph.cut)) > TENSE
     tense = np.convolve(tense, np.ones(2 * AROUND + 1), "same") > 0.5
     sure[1:] &= ~tense
     sure[:-1] &= ~tense

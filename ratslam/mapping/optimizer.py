@@ -24,7 +24,7 @@ from ratslam.mapping.normal_equations import (
     measurement_errors,
     weigh_closures,
 )
-from tactile.base.se2 import bend_motion, correct_heading, wrap
+from tactile.base.se2 import bend_motion, between, correct_heading, wrap
 
 HALVINGS = 10
 """Number of lengths tried of a step."""
@@ -150,6 +150,12 @@ class MapFit(NamedTuple):
     def corrected(self, chain: OdometryChain) -> np.ndarray:
         """[N - 1, 3] the chain's motions without their systematic errors."""
         return correct_heading(chain.motion, chain.length, self.bias, self.turn_error)
+
+    def strain(self, chain: OdometryChain) -> np.ndarray:
+        """[N - 1] chi-squares of the chain."""
+        error = between(self.poses[:-1], self.poses[1:]) - self.corrected(chain)
+        error[:, 2] = wrap(error[:, 2])
+        return (error**2 / chain.variance).sum(axis=1)
 
     def corrected_links(self, links: OdometryLinks) -> np.ndarray:
         """[L, 3] the motions of links without their systematic errors."""

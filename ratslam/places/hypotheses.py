@@ -32,6 +32,10 @@ BESIDE_SHARE = 0.3
 """Share of the evidence against a path that counts beside the way after the first such keyframe of a run."""
 
 
+Onwards = Iterable[tuple[Motion, np.ndarray | None]]
+"""The motion into each further keyframe, and the gains [S, N] of its view, None if it shows nothing."""
+
+
 class Path(NamedTuple):
     """A pose hypothesis followed through n keyframes: poses [n, 3], m, m, rad, and log-odds [n] of each
     keyframe, nat; `first`: the number of the first one in its session."""
@@ -76,17 +80,12 @@ class Path(NamedTuple):
 
 
 def follow(
-    ground: Ground,
-    odds: GainOdds,
-    at: PoseHypothesis,
-    onwards: Iterable[tuple[Motion, np.ndarray | None]],
-    least: float = -np.inf,
+    ground: Ground, odds: GainOdds, at: PoseHypothesis, onwards: Onwards, least: float = -np.inf
 ) -> Path:
     """The path from a pose hypothesis on mapped ground; ends early once its log-odds are below `least`.
 
     Args:
-        onwards: the motion into each further keyframe, and the gains [S, N] of its view, None if it shows
-            nothing.
+        onwards: see `Onwards`.
     """
     poses, gained = [at.pose], [0.0]
     total, inside = 0.0, True

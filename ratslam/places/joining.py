@@ -43,6 +43,8 @@ STANDING = 0.5
 
 Stretches = tuple[int, ...]
 """Numbers of the stretches of keyframes, each from one beginning of a piece to the next, that a piece has."""
+Tried = set[tuple[Stretches, Stretches]]
+"""Pairs of pieces that were compared."""
 
 
 class Join(NamedTuple):
@@ -88,10 +90,7 @@ class _Found(NamedTuple):
 
 
 def join_all(
-    map: KeyframeMap,
-    views: MapViews,
-    tried: set[tuple[Stretches, Stretches]],
-    report: Callable[[str], None] = lambda _: None,
+    map: KeyframeMap, views: MapViews, tried: Tried, report: Callable[[str], None] = lambda _: None
 ) -> list[Join]:
     """Joins pieces of a map, two at a time, until nothing joins any more, and merges keyframes on common
     ground.
@@ -111,9 +110,7 @@ def join_all(
     return joins
 
 
-def _join_some(
-    map: KeyframeMap, views: MapViews, tried: set[tuple[Stretches, Stretches]], report: Callable[[str], None]
-) -> Join | None:
+def _join_some(map: KeyframeMap, views: MapViews, tried: Tried, report: Callable[[str], None]) -> Join | None:
     """Joins the first two pieces that can be joined, of those that were not tried yet."""
     graph = map.kept_keyframes()
     piece, stretch = graph.pieces(map.log), np.cumsum(graph.begins.rows)

@@ -26,7 +26,7 @@ from ratslam.places.localiser import compare_with_itself
 from ratslam.places.placement import Comparison, Traverse, closures_along, find_placements
 from ratslam.recall import filter
 from ratslam.recall.config import RecallConfig, sector_shifts
-from ratslam.recall.memory import MapFeedback, Memory, frozen_memory
+from ratslam.recall.memory import MapFeedback, Memory, init_memory
 from ratslam.recall.observation_model import ObservationLikelihood
 from tactile.base.types import Array
 
@@ -85,7 +85,8 @@ class MapViews:
         feedback = MapFeedback(poses, graph.bias, graph.turn_error, 0.0, *graph.appearance.metric())
         views, labels = graph.appearance.stored(frames)
         capacity = capacity or capacity_at(len(labels))
-        return frozen_memory(self.config, feedback, views, labels, capacity, recall.dtype, recall.groups)
+        empty = init_memory(self.config, views.shape[1], capacity, recall.dtype, recall.groups)
+        return empty.filled(feedback, views, labels)
 
     def ground(self, poses: np.ndarray) -> Ground:
         """Keyframes at `poses` [N, 3] as ground."""

@@ -202,6 +202,21 @@ class Memory(NamedTuple):
         rows, values, likeness = self.pack_feedback(feedback)
         return self.take_feedback((jnp.asarray(rows), jnp.asarray(values), jnp.asarray(likeness)))
 
+    def filled(self, feedback: MapFeedback, views: np.ndarray, labels: np.ndarray) -> Memory:
+        """The memory with N keyframes in the place of none.
+
+        Args:
+            feedback: poses [N, 3] and view metric of the map. views: [N, D], labels: [N] as recall stores
+                them.
+        """
+        filled = self._replace(
+            view=_put(views.T, self.view),
+            label=_put(labels, self.label, -1),
+            count=jnp.int32(len(labels)),
+            distinct=_distinct(labels),
+        )
+        return filled.apply_map_feedback(feedback)
+
     def first_keyframes(self, count: int) -> Memory:
         """The memory as if it held only its first `count` keyframes, and had seen no view before."""
         label = np.array(self.label)
@@ -316,28 +331,3 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         likeness=zeros(*learned),
         before=zeros(len(sector_shifts(config)), capacity if touch else 0),
     )
-
-
-def frozen_memory(
-    config: RecallConfig,
-    feedback: MapFeedback,
-    views: np.ndarray,
-    labels: np.ndarray,
-    capacity: int,
-    dtype: np.dtype,
-    groups: int,
-) -> Memory:
-    """A memory of N keyframes.
-
-    Args:
-        feedback: poses [N, 3] and view metric of the map. views: [N, D], labels: [N] as recall stores them.
-        capacity: rows, at least N. groups: see `init_memory`.
-    """
-    empty = init_memory(config, views.shape[1], capacity, dtype, groups)
-    filled = empty._replace(
-        view=_put(views.T, empty.view),
-        label=_put(labels, empty.label, -1),
-        count=jnp.int32(len(labels)),
-        distinct=_distinct(labels),
-    )
-    return filled.apply_map_feedback(feedback)
