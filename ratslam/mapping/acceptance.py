@@ -23,7 +23,7 @@ from ratslam.mapping.archive import Archive
 from ratslam.mapping.closure_judge import AT_ONCE, judge_sequences
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import CONFIRMED_WEIGHT, Candidate, ClosureLog, Verdict
-from ratslam.mapping.map_solution import MapSolution, cheapest_map, solved_map
+from ratslam.mapping.map_solution import MapSolution, cheapest_map
 from ratslam.mapping.odometry_scan import OdometryScan
 from ratslam.mapping.optimizer import CalibrationPrior
 from ratslam.mapping.verification import break_odometry, judge_by_map, map_distance, spans
@@ -46,7 +46,7 @@ class Acceptance(Checkpointed, ABC):
 
     def solution(self, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
         """The map as it would be if the session ended now; leaves graph and log unchanged."""
-        return solved_map(graph, log)
+        return MapSolution.solved(graph, log)
 
 
 class AcceptByEvidence(Acceptance):
@@ -198,7 +198,7 @@ class AcceptByOdds(Acceptance):
                     break
                 graph.optimise(log)
         if not len(log.accepted_rows()):
-            return solved_map(graph, log)
+            return MapSolution.solved(graph, log)
         return cheapest_map(graph, log, [mean, graph.prior])
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:

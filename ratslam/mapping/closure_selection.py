@@ -39,6 +39,10 @@ COST_TOLERANCE = 0.5
 """Difference in cost, chi-square, below which two cuts count as equally good."""
 
 
+Cuts = tuple[tuple[int, int], ...]
+"""Of the odometry: the keyframe after each cut, and the sequence that shows it."""
+
+
 class SelectionProblem(NamedTuple):
     """The sequences to select from, and the odometry.
 
@@ -57,9 +61,13 @@ class SelectionProblem(NamedTuple):
     views_cost: Callable[[np.ndarray], float]
     place: Place = np.copy
 
-
-Cuts = tuple[tuple[int, int], ...]
-"""Of the odometry: the keyframe after each cut, and the sequence that shows it."""
+    def with_cuts(self, start: MapFit, cuts: Cuts, system: System | None = None) -> Selection:
+        """The fit and its cost with these cuts, from the poses and bias of `start`; system: of the
+        measurements with the cuts, where it is known."""
+        system = system or System(self.measurements.cut_at([frame for frame, _ in cuts]))
+        fit = system.solve(start, STEPS, FINE)
+        cost = system.robust_cost(fit) + self.views_cost(fit.poses)
+        return Selection(fit, cost + CUT * len(cuts), cuts)
 
 
 class Selection(NamedTuple):
@@ -90,7 +98,7 @@ def select_closures(case: SelectionProblem, starts: Sequence[MapFit]) -> Selecti
         the cheapest of the optimised maps.
     """
     system = System(case.measurements)
-    return min((_optimise(case, system, start, ()) for start in starts), key=lambda found: found.cost)
+    return min((case.with_cuts(start, (), system) for start in starts), key=lambda found: found.cost)
 
 
 def select_closures_and_cuts(
@@ -112,7 +120,7 @@ def select_closures_and_cuts(
     """
     best = select_closures(case, starts)
     if earlier:
-        best = min(optimise_with_cuts(case, starts[0], earlier), best, key=lambda found: found.cost)
+        best = min(case.with_cuts(starts[0], earlier), best, key=lambda found: found.cost)
     while True:
         strain = _strain(case, best)
         tried = np.argsort(-strain)[:TRIALS]
@@ -178,7 +186,7 @@ def _cut(case: SelectionProblem, best: Selection, sequence: int, find: FindCut) 
     claimed = _claim(best, case.measurements.closures, first, sequence)
     frame, moved = _carry(case, best, since, first, claimed, poses, find)
     cuts = (*best.cuts, (frame, sequence))
-    found = [optimise_with_cuts(case, best.fit._replace(poses=moved), cuts)]
+    found = [case.with_cuts(best.fit._replace(poses=moved), cuts)]
     accepted = best.fit.weights > ACCEPTED_WEIGHT
     later = np.flatnonzero(accepted & (case.first > case.last[sequence]))
     if accepted[sequence] or not len(later):
@@ -187,7 +195,7 @@ def _cut(case: SelectionProblem, best: Selection, sequence: int, find: FindCut) 
     end, back = int(case.last[sequence]), int(case.first[following])
     again, twice = _carry(case, best, end, back, poses[back], moved, find)
     twice[back:] = poses[back:]
-    return [*found, optimise_with_cuts(case, best.fit._replace(poses=twice), (*cuts, (again, following)))]
+    return [*found, case.with_cuts(best.fit._replace(poses=twice), (*cuts, (again, following)))]
 
 
 def _carry(
@@ -211,17 +219,6 @@ def _carry(
     moved[first + 1 :] = compose(compose(onwards[-1], inverse(poses[first])), poses[first + 1 :])
     moved[frame:] = compose(carried, moved[frame:])
     return frame, moved
-
-
-def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: Cuts) -> Selection:
-    """The fit and its cost with these cuts (keyframe, sequence), from the poses and bias of `start`."""
-    return _optimise(case, System(case.measurements.cut_at([frame for frame, _ in cuts])), start, cuts)
-
-
-def _optimise(case: SelectionProblem, system: System, start: MapFit, cuts: Cuts) -> Selection:
-    fit = system.solve(start, STEPS, FINE)
-    cost = system.robust_cost(fit) + case.views_cost(fit.poses)
-    return Selection(fit, cost + CUT * len(cuts), cuts)
 
 
 KEPT = 4

@@ -19,7 +19,7 @@ from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.appearance import Appearance
 from ratslam.mapping.config import Ablation, KeyframeMapConfig
 from ratslam.mapping.loop_closures import ClosureLog
-from ratslam.mapping.odometry_calibration import learn_heading_noise, starting_calibration, starting_noise
+from ratslam.mapping.odometry_calibration import HeadingNoise, learn_heading_noise, starting_calibration
 from ratslam.mapping.optimizer import (
     LOOSE,
     NO_LINKS,
@@ -79,7 +79,7 @@ class KeyframeGraph(Checkpointed):
         self.links = NO_LINKS
         self.start = self.prior = starting_calibration(config, cell)
         self.bias, self.turn_error = self.prior.bias, self.prior.turn_error
-        self.heading_noise = starting_noise(config)
+        self.heading_noise = HeadingNoise.of_start(config)
         self.reckoned = np.zeros(3)
 
     @property
@@ -309,7 +309,7 @@ class KeyframeGraph(Checkpointed):
 
     def learn_noise(self, fit: MapFit, log: ClosureLog) -> None:
         """Updates the noise of the odometry from a fit that solves the problem of the accepted closures."""
-        start, problem = starting_noise(self.config), self.problem(log, self.cut)
+        start, problem = HeadingNoise.of_start(self.config), self.problem(log, self.cut)
         self.heading_noise = learn_heading_noise(self.heading_noise, start, fit, problem)
 
     def map_covariance(self, log: ClosureLog) -> MapCovariance:

@@ -40,12 +40,7 @@ from ratslam.mapping.closure_selection import (
 )
 from ratslam.mapping.keyframe_graph import KeyframeGraph, Place, number_pieces
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
-from ratslam.mapping.odometry_calibration import (
-    HeadingNoise,
-    learn_heading_noise,
-    log_posterior,
-    starting_noise,
-)
+from ratslam.mapping.odometry_calibration import HeadingNoise, learn_heading_noise, log_posterior
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, System, solve
 from ratslam.mapping.verification import find_break, spans
 from tactile.base.se2 import between, compose, inverse, wrap
@@ -124,6 +119,13 @@ class MapSolution(NamedTuple):
     log: ClosureLog
     cut: GrowableArray
 
+    @classmethod
+    def solved(cls, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
+        """The map with the closures accepted so far, optimised; dead reckoning without any."""
+        if len(log.accepted_rows()):
+            return cls(graph.solve(log, graph.config.settling), log, graph.cut)
+        return cls(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
+
     def placed(self, graph: KeyframeGraph) -> MapSolution:
         """The map with the pieces of `graph` where they belong, see `placed_pieces`; the fit may have moved
         them."""
@@ -180,13 +182,6 @@ class MapSolution(NamedTuple):
         return Obstacle.ONLY_LINK if np.any(self.cut.rows == sequence) else None
 
 
-def solved_map(graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
-    """The map with the closures accepted so far, optimised; dead reckoning without any."""
-    if len(log.accepted_rows()):
-        return MapSolution(graph.solve(log, graph.config.settling), log, graph.cut)
-    return MapSolution(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
-
-
 def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[CalibrationPrior]) -> MapSolution:
     """The map of least cost with the closures accepted so far, reached from the current poses and from dead
     reckoning with the mean of each of these calibrations. The log takes over its robust weights."""
@@ -220,7 +215,7 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypo
         selected = select_closures_and_cuts(problem, starts, partial(find_break, graph), earlier)
     else:
         selected = select_closures(problem, starts)
-        noise, start = graph.heading_noise, starting_noise(config)
+        noise, start = graph.heading_noise, HeadingNoise.of_start(config)
         if noise.log_factor - start.log_factor > NOISY * noise.sd:  # surely above that of the start
             reckoned = _dead_reckoned(graph, problem.measurements.prior, place)
             selected = reselect(problem, selected, reckoned, noise, start)

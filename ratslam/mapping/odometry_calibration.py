@@ -234,11 +234,6 @@ def calibration_from_views(
     return start._replace(bias=shrunk, bias_sd=float(sd))
 
 
-def starting_noise(config: KeyframeMapConfig) -> HeadingNoise:
-    """The noise of heading before any closure."""
-    return HeadingNoise(float(np.log(config.calibration.heading_noise)))
-
-
 def write_calibration(path: Path, calibration: CalibrationPrior, noise: HeadingNoise | None) -> None:
     """Writes means and standard deviations as settings of a configuration.
 
@@ -264,6 +259,11 @@ class HeadingNoise(NamedTuple):
 
     log_factor: float = 0.0
     sd: float = SPREAD
+
+    @classmethod
+    def of_start(cls, config: KeyframeMapConfig) -> HeadingNoise:
+        """The noise before any closure."""
+        return cls(float(np.log(config.calibration.heading_noise)))
 
     @property
     def factor(self) -> float:

@@ -19,7 +19,7 @@ from ratslam.mapping.ground import MAP_WEIGHTING, Ground, Motion
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, Verdict
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.map_solution import MapSolution, selected_solution, solved_map
+from ratslam.mapping.map_solution import MapSolution, selected_solution
 from ratslam.mapping.optimizer import MapCovariance
 from ratslam.places.hypotheses import Path
 from ratslam.places.map_views import MapViews
@@ -154,7 +154,7 @@ def _join(map: KeyframeMap, views: MapViews, one: np.ndarray, other: np.ndarray)
         hypotheses = MapHypotheses()
         hypotheses.begin(trial.fit(), log.sequences)
         selected = selected_solution(trial, log, hypotheses)
-    solution = selected or solved_map(trial, log)
+    solution = selected or MapSolution.solved(trial, log)
     new = np.arange(log.sequences) >= first
     standing = new & (solution.log.verdicts() == Verdict.ACCEPTED)
     scores = solution.log.scores()
