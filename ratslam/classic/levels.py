@@ -307,9 +307,7 @@ def _each_window(level: Level, function: Callable[..., Array], *blocks: Array) -
     return jax.vmap(function)(*blocks)
 
 
-def step_at_smallest_level(
-    levels: Levels, activity: Activity, inputs: StepInput
-) -> tuple[Activity, StepResult]:
+def step_at_smallest(levels: Levels, activity: Activity, inputs: StepInput) -> tuple[Activity, StepResult]:
     """One step of the network, at the smallest level where it is exact.
 
     With the smallest level alone, `level` is 1 from the first step that was not exact there.

@@ -22,7 +22,7 @@ from ratslam.classic.levels import (
     Levels,
     StepInput,
     point_activity,
-    step_at_smallest_level,
+    step_at_smallest,
     window_levels,
 )
 from tactile.base.types import Array, Odometry
@@ -101,7 +101,7 @@ def step(
     energy = levels[0].window.deposit_gain(recall) * energy
     parts = moved / substeps, lag / substeps
     inputs = StepInput(cells.pose, recall, energy, substeps.astype(jnp.int32), *parts, lag[2])
-    activity, (pose, spread, died, level) = step_at_smallest_level(levels, cells.activity, inputs)
+    activity, (pose, spread, died, level) = step_at_smallest(levels, cells.activity, inputs)
 
     world = jnp.stack([*rotate(moved[0], moved[1], (cells.pose[2] + lag[2]) * unit[2]), moved[2]])
     behind = ring_difference(world + lag - (pose - cells.pose), n)

@@ -367,7 +367,7 @@ class LearnedOdds(Checkpointed):
 
 COMMON = 0.5
 """Factor on the logarithm of a view's mean likelihood over the whole ground, subtracted from its gains."""
-COMMON_OF_PIECE = 0.25
+PIECE_COMMON = 0.25
 """The same factor for a piece of a growing map."""
 
 
@@ -393,9 +393,7 @@ def less_where_common(gain: np.ndarray, share: float = COMMON) -> np.ndarray:
 
 MAP_WEIGHTING = GainWeighting(np.asarray, PRIOR, 1.0)
 """For two pieces of finished maps, of which many keyframes are compared."""
-PIECE_WEIGHTING = GainWeighting(
-    partial(less_where_common, share=COMMON_OF_PIECE), ((2.4, 0.8), (1.0, 1.6)), 1.5
-)
+PIECE_WEIGHTING = GainWeighting(partial(less_where_common, share=PIECE_COMMON), ((2.4, 0.8), (1.0, 1.6)), 1.5)
 """For the newest piece of a growing map."""
 SESSION_WEIGHTING = GainWeighting(less_where_common, ((2.95, 0.8), (1.55, 1.6)), 2.0)
 """For a session of which few keyframes are known."""

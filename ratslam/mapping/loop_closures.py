@@ -17,9 +17,7 @@ import numpy as np
 from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.optimizer import LoopClosures
 
-CSV_COLUMNS = (
-    "keyframe,match,step,match_step,shift,posterior,log_ratio,sequence,distance,verdict,weight,log_odds"
-)
+HEADER = "keyframe,match,step,match_step,shift,posterior,log_ratio,sequence,distance,verdict,weight,log_odds"
 
 UNLIKELY = -1.5
 """Log-odds below which the evidence of a sequence counts less; true ones of a young session, or of one
@@ -366,7 +364,7 @@ class ClosureLog(Checkpointed):
 
 def write_closures(path: Path, table: np.ndarray, first_step: np.ndarray) -> None:
     """Writes the candidates of `ClosureLog.table` as CSV; first_step: [N] the step of each keyframe."""
-    lines = [CSV_COLUMNS]
+    lines = [HEADER]
     for frame, match, shift, posterior, ratio, sequence, distance, verdict, weight, odds in table.tolist():
         frame, match = int(frame), int(match)
         lines.append(

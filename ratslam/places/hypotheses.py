@@ -79,17 +79,15 @@ class Path(NamedTuple):
         return np.where(again & (odds > 0), AGAIN_SHARE * odds, odds)
 
 
-def follow(
-    ground: Ground, odds: GainOdds, at: PoseHypothesis, onwards: Onwards, least: float = -np.inf
-) -> Path:
+def follow(ground: Ground, odds: GainOdds, at: PoseHypothesis, way: Onwards, least: float = -np.inf) -> Path:
     """The path from a pose hypothesis on mapped ground; ends early once its log-odds are below `least`.
 
     Args:
-        onwards: see `Onwards`.
+        way: from there on, see `Onwards`.
     """
     poses, gained = [at.pose], [0.0]
     total, inside = 0.0, True
-    for moved, gains in onwards:
+    for moved, gains in way:
         at, gain = advance(ground, at, moved, gains)
         log_odds, inside = keyframe_odds(ground, odds, at.pose, gain, inside)
         poses.append(at.pose)

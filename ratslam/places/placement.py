@@ -58,13 +58,11 @@ class _RecalledPose(NamedTuple):
         """Whether the pose is to be proposed for the newest keyframe."""
         return self.now and self.agreeing >= CONFIRMING
 
-    def onwards(
-        self, ground: Ground, moved: Motion, shift: int, match: int, posterior: float
-    ) -> _RecalledPose:
+    def onwards(self, ground: Ground, moved: Motion, shift: int, match: int, mass: float) -> _RecalledPose:
         """After the next keyframe, reached by `moved`, which recall places at keyframe `match` of the ground
-        (-1: nowhere), turned by the sector shift of row `shift`, with this posterior."""
+        (-1: nowhere), turned by the sector shift of row `shift`, with this posterior `mass`."""
         expected = compose(self.pose, moved.motion)
-        if match < 0 or posterior <= 0.5:
+        if match < 0 or mass <= 0.5:
             return _RecalledPose(expected, self.agreeing, False)
         pose = ground.claims(np.array([shift]), np.array([match]))[0]
         error = between(expected, pose)
