@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.classic.levels import Activity, Level
+from ratslam.classic.levels import Activity, Levels
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Array
@@ -27,13 +27,11 @@ def choose_cells(
     Raises:
         InputError: the network has fewer cells, or not these.
     """
-    rings = np.array(shape[::-1])
+    rings, size = np.array(shape[::-1]), math.prod(shape)
     if isinstance(chosen, int):
-        if chosen > np.prod(rings):
-            raise InputError(
-                "cells.chosen", str(chosen), f"at most {np.prod(rings)}, the cells of the network"
-            )
-        drawn = stream(seed, "attractor.recorded_cells").choice(int(np.prod(rings)), chosen, replace=False)
+        if chosen > size:
+            raise InputError("cells.chosen", str(chosen), f"at most {size}, the cells of the network")
+        drawn = stream(seed, "attractor.recorded_cells").choice(size, chosen, replace=False)
         return np.sort(drawn).astype(np.int32)
     at = np.array(chosen, np.int64).reshape(-1, 3)
     for number in np.flatnonzero((at >= rings).any(axis=1)):
@@ -42,7 +40,7 @@ def choose_cells(
     return ((at[:, 2] * rings[1] + at[:, 1]) * rings[0] + at[:, 0]).astype(np.int32)
 
 
-def hold_cells(levels: tuple[Level, ...], activity: Activity) -> tuple[Array, Array, Array]:
+def hold_cells(levels: Levels, activity: Activity) -> tuple[Array, Array, Array]:
     """The windows of the level that holds the activity, for `active_cells`: a window of 16^3 cells is read
     and summed in a fraction of the time that the whole torus takes.
 
@@ -63,9 +61,7 @@ def hold_cells(levels: tuple[Level, ...], activity: Activity) -> tuple[Array, Ar
     return activity.level, *lax.switch(activity.level, choices)
 
 
-def active_cells(
-    levels: tuple[Level, ...], held: tuple[Array, Array, Array]
-) -> tuple[np.ndarray, np.ndarray]:
+def active_cells(levels: Levels, held: tuple[Array, Array, Array]) -> tuple[np.ndarray, np.ndarray]:
     """Indices [n] of the active cells in the flattened network and their activity [n] float32, on the host; a
     cell comes twice where two windows overlap."""
     number, origin, cells = held
@@ -78,7 +74,7 @@ def active_cells(
     return (own[0] * y + own[1]) * x + own[2], cells[at]
 
 
-def activity_of(levels: tuple[Level, ...], activity: Activity, cell: np.ndarray) -> Array:
+def activity_of(levels: Levels, activity: Activity, cell: np.ndarray) -> Array:
     """[C] activity of the cells with these indices [C] in the flattened network.
 
     All levels are read and one is kept: reading a few cells costs less than a branch.

@@ -18,6 +18,9 @@ Chosen = Annotated[
 ]
 
 
+Extent = tuple[float, float, float, float] | None
+
+
 class CellSumsConfig(Settings):
     """Sums of the activity of all cells over bins of the true pose; steps whose true pose is not known or
     outside the extent are left out."""
@@ -28,15 +31,13 @@ class CellSumsConfig(Settings):
     """Heading bins, the first centred on heading 0."""
     rate: PositiveFloat = 10.0
     """Summed steps per second, each for the time since the one before; every step of a slower source."""
-    extent: tuple[float, float, float, float] | None = None
+    extent: Extent = None
     """The binned rectangle x0, y0, x1, y1, m, in the frame of the true poses. null: that of the true path,
     where it is known before the run: of simulations and recordings held in memory."""
 
     @field_validator("extent")
     @classmethod
-    def _has_area(
-        cls, extent: tuple[float, float, float, float] | None
-    ) -> tuple[float, float, float, float] | None:
+    def _has_area(cls, extent: Extent) -> Extent:
         if extent is not None and not (extent[0] < extent[2] and extent[1] < extent[3]):
             raise ValueError("x0, y0, x1, y1 with x0 < x1 and y0 < y1")
         return extent

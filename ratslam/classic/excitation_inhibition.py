@@ -138,9 +138,8 @@ class Window(NamedTuple):
     def peak_index(self, activity: Array, origin: Array) -> Array:
         """int32 index of the cell with the largest activity, in the flattened torus."""
         first, ring = origin[::-1], self.ring_sizes()[::-1]
-        heading, y, x = (
-            (a + b) % n for a, b, n in zip(_peak(self, activity, first), first, ring, strict=True)
-        )
+        peak = zip(_peak(self, activity, first), first, ring, strict=True)
+        heading, y, x = ((a + b) % n for a, b, n in peak)
         return (heading * ring[1] + y) * ring[2] + x
 
     def margin_is_empty(self, activity: Array) -> Array:
@@ -268,9 +267,8 @@ def _shifter(window: Window, activity: Array, k: int, reach: int) -> Callable[[i
         before = lax.slice_in_dim(activity, size - reach, size, axis=k)
         after = lax.slice_in_dim(activity, 0, reach, axis=k)
     else:
-        before = after = jnp.zeros(
-            [reach if a == k else n for a, n in enumerate(activity.shape)], activity.dtype
-        )
+        shape = [reach if a == k else n for a, n in enumerate(activity.shape)]
+        before = after = jnp.zeros(shape, activity.dtype)
     # The barrier makes one array of the three pieces; without it every cell costs a branch.
     padded = lax.optimization_barrier(jnp.concatenate([before, activity, after], axis=k))
     return lambda t: lax.slice_in_dim(padded, reach - t, reach - t + size, axis=k)

@@ -143,10 +143,7 @@ class ExperienceMap(Checkpointed, Map):
 
     def edges(self) -> Edges:
         """All links: ends, motion and information."""
-        ends = self._ends.rows
-        return Edges(
-            ends[:, 0].copy(), ends[:, 1].copy(), self._motion.rows.copy(), self._information.rows.copy()
-        )
+        return Edges(*self._ends.rows.T.copy(), self._motion.rows.copy(), self._information.rows.copy())
 
     def trajectory(self) -> np.ndarray:
         """[T, 3] poses of all steps: present pose of the step's node, and the motion since; the odometry to
@@ -219,12 +216,9 @@ class ExperienceMap(Checkpointed, Map):
         heading = noise.heading_per_metre**2 * length + noise.heading_per_radian**2 * abs(moved[2])
         along = noise.per_metre**2 * length
         travel = self._travel
-        self._travel = Travel(
-            compose(travel.motion, moved),
-            travel.variance + np.array([along, along, heading]),
-            travel.length + length,
-            travel.duration + float(odometry.dt),
-        )
+        variance = travel.variance + np.array([along, along, heading])
+        duration = travel.duration + float(odometry.dt)
+        self._travel = Travel(compose(travel.motion, moved), variance, travel.length + length, duration)
 
     def _create(self, place: int, template: int, relative: float) -> None:
         node = len(self._pose.rows)
@@ -279,24 +273,16 @@ class ExperienceMap(Checkpointed, Map):
         """Moves the nodes: by least squares at a loop closure, or by the relaxation after every action."""
         solver = self.config.solver
         if isinstance(solver, LeastSquares) and closure:
-            kernels = {
-                "none": no_kernel,
-                "huber": huber(solver.scale),
-                "geman_mcclure": geman_mcclure(solver.scale**2),
-            }
-            poses, edges = self._pose.rows, self.edges()
+            poses, edges, scale = self._pose.rows, self.edges(), solver.scale
+            kernels = {"none": no_kernel, "huber": huber(scale), "geman_mcclure": geman_mcclure(scale**2)}
             self._growing = growing_equations(len(poses), edges, self._growing)
-            solution = least_squares(
-                poses, edges, kernel=kernels[solver.kernel], robust=self._closure.rows,
-                equations=self._growing,
-            )  # fmt: skip
+            kernel, robust = kernels[solver.kernel], self._closure.rows
+            solution = least_squares(poses, edges, kernel=kernel, robust=robust, equations=self._growing)
             self._pose.rows[:] = solution.poses
         elif isinstance(solver, Relaxation) and len(self._ends.rows):
-            ends, motion = self._ends.rows, self._motion.rows
-            self._pose.rows[:] = relax(
-                self._pose.rows, ends[:, 0], ends[:, 1], np.hypot(motion[:, 0], motion[:, 1]),
-                np.arctan2(motion[:, 1], motion[:, 0]), motion[:, 2], solver.loops, solver.correction,
-            )  # fmt: skip
+            x, y, turn = self._motion.rows.T
+            links = (*self._ends.rows.T, np.hypot(x, y), np.arctan2(y, x), turn)
+            self._pose.rows[:] = relax(self._pose.rows, links, solver.loops, solver.correction)
 
     def _origin(self) -> np.ndarray:
         return self._pose.rows[self._current] if self._current >= 0 else np.zeros(3)
@@ -388,17 +374,13 @@ def decide(
 
     travelled = (reach | create) & (previous >= 0)
     pair = jnp.stack([previous, place])
-    joined = jnp.any(
-        jnp.all(store.link == pair[None, :], axis=1) | jnp.all(store.link == pair[None, ::-1], axis=1)
-    )
+    forth, back = (jnp.all(store.link == ends[None, :], axis=1) for ends in (pair, pair[::-1]))
+    joined = jnp.any(forth | back)
     new_link = travelled & ~joined & (store.links < capacity)
     at = jnp.minimum(store.links, capacity - 1)
     end = jnp.minimum(store.count, capacity - 1)
-    action = jnp.where(
-        create,
-        Action.CREATE,
-        jnp.where(reach, jnp.where(joined | (previous < 0), Action.SET, Action.LINK), Action.NONE),
-    )
+    reaching = jnp.where(joined | (previous < 0), Action.SET, Action.LINK)
+    action = jnp.where(create, Action.CREATE, jnp.where(reach, reaching, Action.NONE))
     store = Places(
         packet=store.packet.at[end].set(jnp.where(create, packet, store.packet[end])),
         template=store.template.at[end].set(jnp.where(create, template, store.template[end])),

@@ -44,6 +44,10 @@ class Level(NamedTuple):
     follows_pose: bool = False
 
 
+Levels = tuple[Level, ...]
+"""From the smallest to the whole torus."""
+
+
 class Block(NamedTuple):
     """The activity of one level: activity [C, H, Y, X] of its windows, and origin [C, 3], int32, the first
     cell of each window over x, y, heading."""
@@ -59,7 +63,7 @@ class Activity(NamedTuple):
     level: Array
 
 
-def window_levels(config: NetworkConfig, dtype: np.dtype) -> tuple[Level, ...]:
+def window_levels(config: NetworkConfig, dtype: np.dtype) -> Levels:
     """The levels from the smallest to the whole torus."""
     torus = Level(make_window(config, None, dtype), 1)
     if config.engine == "dense":
@@ -70,7 +74,7 @@ def window_levels(config: NetworkConfig, dtype: np.dtype) -> tuple[Level, ...]:
     return (*(level for level in lower if level.windows * np.prod(level.window.shape) <= most), torus)
 
 
-def point_activity(levels: tuple[Level, ...], pose: Array) -> Activity:
+def point_activity(levels: Levels, pose: Array) -> Activity:
     """Unit activity at a pose [3], shared among its neighbour cells, at the smallest level."""
     smallest, dtype = levels[0].window, pose.dtype
     origin = smallest.origin_centred_on(pose)
@@ -82,27 +86,25 @@ def point_activity(levels: tuple[Level, ...], pose: Array) -> Activity:
     return Activity(tuple(blocks), jnp.int32(0))
 
 
-def to_full_torus(levels: tuple[Level, ...], activity: Activity) -> Array:
+def to_full_torus(levels: Levels, activity: Activity) -> Array:
     """[K, N, N] the activity of the whole torus."""
     return block_at(levels, len(levels) - 1, activity, jnp.zeros(3, jnp.int32)).activity[0]
 
 
-def activity_sums(levels: tuple[Level, ...], activity: Activity) -> PoseCellActivity:
+def activity_sums(levels: Levels, activity: Activity) -> PoseCellActivity:
     """The activity summed over the headings, and over x and y; on the host, without compiling."""
     sizes = levels[-1].window.ring_sizes()
     xy, heading = np.zeros(sizes[1::-1]), np.zeros(sizes[2])
     block = activity.blocks[int(activity.level)]
     for cells, origin in zip(np.asarray(block.activity), np.asarray(block.origin), strict=True):
-        at = [
-            (first + np.arange(size)) % ring
-            for first, size, ring in zip(origin[::-1], cells.shape, sizes[::-1], strict=True)
-        ]
+        ranges = zip(origin[::-1], cells.shape, sizes[::-1], strict=True)
+        at = [(first + np.arange(size)) % ring for first, size, ring in ranges]
         np.add.at(xy, np.ix_(at[1], at[2]), cells.sum(axis=0))
         np.add.at(heading, at[0], cells.sum(axis=(1, 2)))
     return PoseCellActivity(xy, heading)
 
 
-def block_at(levels: tuple[Level, ...], k: int, activity: Activity, origin: Array) -> Block:
+def block_at(levels: Levels, k: int, activity: Activity, origin: Array) -> Block:
     """The activity at level k, from whichever level up to k holds it; a new window begins at `origin` [3]."""
 
     def transfer_from(j: int) -> Callable[[], Block]:
@@ -305,9 +307,7 @@ def _each_window(level: Level, function: Callable[..., Array], *blocks: Array) -
     return jax.vmap(function)(*blocks)
 
 
-def step_at_smallest_level(
-    levels: tuple[Level, ...], activity: Activity, inputs: StepInput
-) -> tuple[Activity, StepResult]:
+def step_at_smallest(levels: Levels, activity: Activity, inputs: StepInput) -> tuple[Activity, StepResult]:
     """One step of the network, at the smallest level where it is exact.
 
     With the smallest level alone, `level` is 1 from the first step that was not exact there.
@@ -336,9 +336,7 @@ def step_at_smallest_level(
     return after, result
 
 
-def _attempt(
-    levels: tuple[Level, ...], k: int, smallest: Block, held: Array, inputs: StepInput, carry: Any
-) -> Any:
+def _attempt(levels: Levels, k: int, smallest: Block, held: Array, inputs: StepInput, carry: Any) -> Any:
     """The step at level k; the result is moved to the smallest level if it fits there.
 
     Args:
@@ -367,7 +365,7 @@ def _attempt(
     return to_try, after, (*result[:3], jnp.int32(k))
 
 
-def _middle(levels: tuple[Level, ...], activity: Activity, inputs: StepInput) -> Array:
+def _middle(levels: Levels, activity: Activity, inputs: StepInput) -> Array:
     """[3] midway between the packet and the second one, or else the position of the injection."""
     ring = levels[0].window.ring_sizes().astype(inputs.pose.dtype)
     other = jnp.where(inputs.energy > 0, inputs.injection, inputs.pose)

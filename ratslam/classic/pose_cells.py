@@ -19,10 +19,10 @@ from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.excitation_inhibition import TIE, ring_difference, rotate
 from ratslam.classic.levels import (
     Activity,
-    Level,
+    Levels,
     StepInput,
     point_activity,
-    step_at_smallest_level,
+    step_at_smallest,
     window_levels,
 )
 from tactile.base.types import Array, Odometry
@@ -66,7 +66,7 @@ class PoseCells(NamedTuple):
     settling: Array
 
 
-def start(config: NetworkConfig, dtype: np.dtype, levels: tuple[Level, ...] | None = None) -> PoseCells:
+def start(config: NetworkConfig, dtype: np.dtype, levels: Levels | None = None) -> PoseCells:
     """A single active cell in the middle of the torus; with all window levels, or with those given."""
     pose = jnp.asarray(rings(config, dtype) // 2)
     activity = point_activity(levels or window_levels(config, dtype), pose)
@@ -74,12 +74,7 @@ def start(config: NetworkConfig, dtype: np.dtype, levels: tuple[Level, ...] | No
 
 
 def step(
-    config: NetworkConfig,
-    levels: tuple[Level, ...],
-    cells: PoseCells,
-    odometry: Odometry,
-    recall: Array,
-    energy: Array,
+    config: NetworkConfig, levels: Levels, cells: PoseCells, odometry: Odometry, recall: Array, energy: Array
 ) -> tuple[PoseCells, tuple[Array, Array, Array]]:
     """One step of the network.
 
@@ -106,7 +101,7 @@ def step(
     energy = levels[0].window.deposit_gain(recall) * energy
     parts = moved / substeps, lag / substeps
     inputs = StepInput(cells.pose, recall, energy, substeps.astype(jnp.int32), *parts, lag[2])
-    activity, (pose, spread, died, level) = step_at_smallest_level(levels, cells.activity, inputs)
+    activity, (pose, spread, died, level) = step_at_smallest(levels, cells.activity, inputs)
 
     world = jnp.stack([*rotate(moved[0], moved[1], (cells.pose[2] + lag[2]) * unit[2]), moved[2]])
     behind = ring_difference(world + lag - (pose - cells.pose), n)

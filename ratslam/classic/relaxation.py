@@ -6,6 +6,7 @@ comparison: it needs thousands of sweeps for the result of one solve by `ratslam
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import cos, pi, sin
 
 import numpy as np
@@ -13,30 +14,19 @@ import numpy as np
 from tactile.base.se2 import wrap
 
 
-def relax(
-    poses: np.ndarray,
-    start: np.ndarray,
-    end: np.ndarray,
-    distance: np.ndarray,
-    heading: np.ndarray,
-    facing: np.ndarray,
-    loops: int,
-    correction: float,
-) -> np.ndarray:
-    """Poses [N, 3] after `loops` sweeps over the links [L], from node `start` to node `end`.
+def relax(poses: np.ndarray, links: Sequence[np.ndarray], loops: int, correction: float) -> np.ndarray:
+    """Poses [N, 3] after `loops` sweeps over the links.
 
     Args:
-        distance, heading: [L] polar position of `end` in the frame of `start`, m and rad. facing: [L] heading
-            of `end` in that frame, rad.
+        links: [L] of each the nodes at its start and end; distance (m) and direction (rad) of the end in the
+            frame of the start; and the heading of the end in that frame, rad.
         correction: share of a link's error by which each end moves.
     """
     # Plain floats: every link depends on the one before, so the loop cannot be vectorised.
     x, y, th = (column.tolist() for column in np.asarray(poses, float).T)
-    links = list(
-        zip(*(np.asarray(column).tolist() for column in (start, end, distance, heading, facing)), strict=True)
-    )
+    rows = list(zip(*(column.tolist() for column in links), strict=True))
     for _ in range(loops):
-        for a, b, far, aside, turned in links:
+        for a, b, far, aside, turned in rows:
             bearing = th[a] + aside
             ex = correction * (x[b] - (x[a] + far * cos(bearing)))
             ey = correction * (y[b] - (y[a] + far * sin(bearing)))

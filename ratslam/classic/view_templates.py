@@ -104,9 +104,8 @@ def normalise(config: TemplateConfig, view: Array) -> Array:
     """The view [R, C, K] normalised for comparison (Ball et al. 2013: globally, then by patches)."""
     if config.normalise_mean:
         mean = jnp.mean(view)
-        view = jnp.where(
-            mean > 0, jnp.clip(view * (config.normalise_mean / jnp.where(mean > 0, mean, 1.0)), 0, 1), view
-        )
+        scaled = view * (config.normalise_mean / jnp.where(mean > 0, mean, 1.0))
+        view = jnp.where(mean > 0, jnp.clip(scaled, 0, 1), view)
     if not config.patch:
         return view
     half, (rows, columns, _) = config.patch, view.shape
@@ -182,13 +181,9 @@ def recall(config: TemplateConfig, store: Templates, match: Match, seen: Array) 
     energy = jnp.where(known & old, jnp.maximum(energy, 0.0), 0.0)
     levels = store.habituation.at[row].set(jnp.where(known, level, store.habituation[row]))
     rested = jnp.maximum(levels - config.recovery, config.habituation)
-    return (
-        store._replace(
-            habituation=jnp.where(seen, rested, store.habituation),
-            current=jnp.where(known, match.template, store.current),
-        ),
-        energy,
-    )
+    habituation = jnp.where(seen, rested, store.habituation)
+    current = jnp.where(known, match.template, store.current)
+    return store._replace(habituation=habituation, current=current), energy
 
 
 def learn(
@@ -199,15 +194,11 @@ def learn(
     room = store.count < capacity
     kept = novel & room
     row = jnp.minimum(store.count, capacity - 1)
-    count = store.count + kept.astype(jnp.int32)
-    column = jnp.where(kept, view, store.view[:, row])
-    return (
-        store._replace(
-            view=store.view.at[:, row].set(column),
-            label=store.label.at[row].set(jnp.where(kept, label, store.label[row])),
-            packet=store.packet.at[row].set(jnp.where(kept, packet, store.packet[row])),
-            count=count,
-            current=jnp.where(kept, store.count, store.current),
-        ),
-        room | ~novel,
+    store = store._replace(
+        view=store.view.at[:, row].set(jnp.where(kept, view, store.view[:, row])),
+        label=store.label.at[row].set(jnp.where(kept, label, store.label[row])),
+        packet=store.packet.at[row].set(jnp.where(kept, packet, store.packet[row])),
+        count=store.count + kept.astype(jnp.int32),
+        current=jnp.where(kept, store.count, store.current),
     )
+    return store, room | ~novel

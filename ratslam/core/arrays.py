@@ -200,6 +200,16 @@ class Checkpointed:
         for name in self._parts():
             getattr(self, name).restore(with_prefix(arrays, f"{name.lstrip('_')}/"))
 
+    def _append_row(self, *values: Any) -> None:
+        """Appends a row to every growable array, whose values come in the order in which these were made."""
+        for array, value in zip(self._growable_arrays().values(), values, strict=True):
+            array.append(value)
+
+    def _take_rows(self, rows: np.ndarray | slice) -> None:
+        """Reduces every growable array to rows: numbers, bool of each, or a slice."""
+        for array in self._growable_arrays().values():
+            array.replace(array.rows[rows])
+
     def _growable_arrays(self) -> dict[str, GrowableArray]:
         found = vars(self).items()
         return {name.lstrip("_"): value for name, value in found if isinstance(value, GrowableArray)}

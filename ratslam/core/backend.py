@@ -10,6 +10,7 @@ counts. `PathMap` is the smallest map: the path of a backend's own estimates.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
@@ -18,7 +19,15 @@ import jax
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
-from ratslam.core.estimates import Estimate, GridDrawing, PoseCellActivity
+from ratslam.core.estimates import (
+    Estimate,
+    GridDrawing,
+    LocalisedCourse,
+    LocalisedPose,
+    PoseCellActivity,
+    pieces_of,
+    write_course,
+)
 from tactile.base.errors import InputError
 from tactile.base.types import Array, Observation
 
@@ -272,3 +281,52 @@ class PathMap(Checkpointed, Map):
     def files(self) -> dict[str, Callable[[Path], None]]:
         """None."""
         return {}
+
+
+class LocalisedMap(Checkpointed, Map):
+    """The poses and states of a session that is localised in a finished map, which does not change.
+
+    Args:
+        name, digest: an array that tells the finished map from others, and its name in a checkpoint.
+    """
+
+    def __init__(self, name: str, digest: np.ndarray) -> None:
+        self._name, self._digest, self._course = name, digest, LocalisedCourse()
+
+    @abstractmethod
+    def localisation(self) -> LocalisedPose:
+        """The robot's pose now, and whether it is known."""
+
+    def pose(self, estimate: Estimate) -> np.ndarray:
+        del estimate
+        return self.localisation().pose.copy()
+
+    def trajectory(self) -> np.ndarray:
+        """[T, 3] poses of all steps, as they were given at the time."""
+        return self._course.pose.rows.copy()
+
+    def states(self) -> np.ndarray:
+        """[T] the `Localisation` at each step."""
+        return self._course.states.rows.copy()
+
+    def pieces(self) -> np.ndarray:
+        return pieces_of(self._course.states.rows)
+
+    def files(self) -> dict[str, Callable[[Path], None]]:
+        """State, mass and log-odds of every step as CSV."""
+        course = self._course
+        return {"localisation.csv": lambda path: write_course(path, course.states.rows, course.record.rows)}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The whole state, with what tells the finished map from others."""
+        return super().arrays() | {self._name: self._digest.copy()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Replaces the whole state by that of `arrays`.
+
+        Raises:
+            ValueError: the finished map has changed since.
+        """
+        if not np.array_equal(arrays[self._name], self._digest):
+            raise ValueError("a session in another map, or in this one before it was changed")
+        super().restore(arrays)

@@ -134,12 +134,9 @@ class LocalisedCourse(Checkpointed):
         self.states = GrowableArray((), np.int64)
         self.record = GrowableArray((3,), np.float64)
 
-    def append(self, now: LocalisedPose) -> None:
-        """Adds a step."""
-        deviation = float(np.sqrt(max(np.linalg.eigvalsh(now.covariance[:2, :2])[1], 0.0)))
-        self.pose.append(now.pose)
-        self.states.append(int(now.state))
-        self.record.append((now.mass, now.log_odds, deviation))
+    def append(self, now: LocalisedPose, deviation: float) -> None:
+        """Adds a step; deviation: see `write_course`."""
+        self._append_row(now.pose, int(now.state), (now.mass, now.log_odds, deviation))
 
 
 def pieces_of(states: np.ndarray) -> np.ndarray:

@@ -182,10 +182,8 @@ class Expectation:
         radius = BODY * body
         if radius:
             angle = np.arange(8) * np.pi / 4
-            rim = np.concatenate(
-                [np.zeros((1, 2)), radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)]
-            )
-            most = np.max([surfaces.at(evidence, centres + off) for off in rim], axis=0)
+            rim = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            most = np.max([surfaces.at(evidence, centres + off) for off in (np.zeros(2), *rim)], axis=0)
             self.body = np.digitize(most, BODY_LIMITS).astype(np.uint8).reshape(-1)
 
     def places(self, free: int, apart: float, apart_heading: float) -> float:

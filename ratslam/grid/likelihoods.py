@@ -20,9 +20,8 @@ HALF_WEIGHT_LENGTH = 0.5
 
 def free_space(config: LikelihoodConfig, evidence: Array, among: Array) -> Array:
     """[N] log-likelihood of free points with log-odds `evidence` [N, K]; `among` [K]: which count."""
-    return -config.free * (
-        jax.nn.softplus(evidence + _logit(config.unexplored)) @ among.astype(evidence.dtype)
-    )
+    cost = jax.nn.softplus(evidence + _logit(config.unexplored))
+    return -config.free * (cost @ among.astype(evidence.dtype))
 
 
 def contact(config: LikelihoodConfig, evidence: Array, among: Array) -> Array:

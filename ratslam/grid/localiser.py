@@ -20,17 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ratslam.core.arrays import Checkpointed
-from ratslam.core.backend import Map
-from ratslam.core.estimates import (
-    Estimate,
-    GridDrawing,
-    Localisation,
-    LocalisedCourse,
-    LocalisedPose,
-    pieces_of,
-    write_course,
-)
+from ratslam.core.backend import LocalisedMap
+from ratslam.core.estimates import Estimate, GridDrawing, Localisation, LocalisedPose
 from ratslam.grid import particles
 from ratslam.grid.config import GridConfig
 from ratslam.grid.contact_features import ContactFeatures
@@ -44,7 +35,7 @@ LEAST_SHARE = 0.5
 """Share of the pose hypotheses that are the best one below which a found pose is lost."""
 
 
-class GridLocaliser(Checkpointed, Map):
+class GridLocaliser(LocalisedMap):
     """The map of the localise backend for grid maps: the poses of a session in a finished map.
 
     Args:
@@ -56,36 +47,18 @@ class GridLocaliser(Checkpointed, Map):
     PARTS = ("_course",)
 
     def __init__(self, drawn: GridDrawing, digest: np.ndarray, log_odds: float, known: bool = False) -> None:
-        self._drawn, self._digest, self._needed = drawn, digest, log_odds
+        super().__init__("digest", digest)
+        self._drawn, self._needed = drawn, log_odds
         self._state = int(Localisation.FOUND if known else Localisation.SEARCHING)
         self._failed = 0  # searches that failed in a row
         self._now_pose, self._now_covariance = np.zeros(3), np.zeros((3, 3))
         self._now_mass, self._now_log_odds = 0.0, 0.0
-        self._course = LocalisedCourse()
 
     # Queries
 
     def localisation(self) -> LocalisedPose:
-        """The robot's pose now, and whether it is known."""
-        return LocalisedPose(
-            Localisation(self._state), self._now_pose, self._now_covariance, self._now_mass,
-            self._now_log_odds,
-        )  # fmt: skip
-
-    def pose(self, estimate: Estimate) -> np.ndarray:
-        del estimate
-        return self._now_pose.copy()
-
-    def trajectory(self) -> np.ndarray:
-        """[T, 3] poses of all steps: the most likely one at that time, whether it was believed or not."""
-        return self._course.pose.rows.copy()
-
-    def states(self) -> np.ndarray:
-        """[T] the `Localisation` at each step."""
-        return self._course.states.rows.copy()
-
-    def pieces(self) -> np.ndarray:
-        return pieces_of(self._course.states.rows)
+        state = Localisation(self._state)
+        return LocalisedPose(state, self._now_pose, self._now_covariance, self._now_mass, self._now_log_odds)
 
     def grid(self) -> GridDrawing:
         """The finished map."""
@@ -93,11 +66,8 @@ class GridLocaliser(Checkpointed, Map):
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """State, mass and log-odds of every step as CSV, and the finished map."""
-        course = self._course
-        return {
-            "localisation.csv": lambda path: write_course(path, course.states.rows, course.record.rows),
-            "grid.npz": lambda path: np.savez_compressed(path, **self._drawn._asdict()),
-        }
+        drawn = self._drawn._asdict()
+        return super().files() | {"grid.npz": lambda path: np.savez_compressed(path, **drawn)}
 
     # Changes
 
@@ -111,22 +81,9 @@ class GridLocaliser(Checkpointed, Map):
         self._now_mass = share * _chance(odds - self._needed)
         self._judge(share, odds, bool(evidence.failed))
         now = self.localisation()
-        self._course.append(now)
+        variance = np.linalg.eigvalsh(now.covariance[:2, :2])[1]
+        self._course.append(now, float(np.sqrt(max(variance, 0.0))))
         return now.complete(estimate)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The whole state, with what tells the finished map from others."""
-        return super().arrays() | {"digest": self._digest.copy()}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`.
-
-        Raises:
-            ValueError: the finished map has changed since.
-        """
-        if not np.array_equal(arrays["digest"], self._digest):
-            raise ValueError("a session in another map, or in this one before it was changed")
-        super().restore(arrays)
 
     def _judge(self, share: float, odds: float, failed: bool) -> None:
         """Finds, keeps or loses the pose."""
@@ -278,9 +235,8 @@ class Search:
         side = BIN * self.config.cell
         across = int(np.ceil(self._extent / side))
         turn = 2 * np.pi / BINS_AROUND
-        column, row = jnp.clip(
-            jnp.floor((pose[:, :2] + self._extent / 2) / side).astype(jnp.int32), 0, across - 1
-        ).T
+        at = jnp.floor((pose[:, :2] + self._extent / 2) / side).astype(jnp.int32)
+        column, row = jnp.clip(at, 0, across - 1).T
         heading = jnp.floor(pose[:, 2] / turn).astype(jnp.int32) % BINS_AROUND
         index = (row * across + column) * BINS_AROUND + heading
         binned = jnp.zeros(across * across * BINS_AROUND, self.dtype).at[index].add(share)

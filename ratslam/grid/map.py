@@ -161,11 +161,9 @@ class GridMap(Checkpointed, Map):
     def update(self, observation: Observation, estimate: Estimate, evidence: Any) -> Estimate:
         """Stores the particles and the contacts."""
         self._genealogy.append(evidence.poses, evidence.weights, evidence.ancestor)
-        self._online.append(estimate.pose)
-        self._motion.append(int(observation.motion))
-        self._flags.append(np.stack([observation.contact, observation.alive], axis=1))
-        self._point.append(observation.point)
-        self._wall.append(observation.wall_point if observation.wall else [np.nan, np.nan])
+        flags = np.stack([observation.contact, observation.alive], axis=1)
+        wall = observation.wall_point if observation.wall else [np.nan, np.nan]
+        self._append_row(estimate.pose, int(observation.motion), flags, observation.point, wall)
         return estimate
 
     def trajectory(self) -> np.ndarray:

@@ -156,21 +156,17 @@ def copy_particles(
     config: ResamplingConfig, particles: Particles, drawn: Resampling, key: Array
 ) -> Particles:
     """The resampled particles with equal weights; copies are displaced by small random amounts."""
-    dtype = particles.pose.dtype
-    new = (drawn.ancestor != jnp.arange(len(drawn.ancestor), dtype=jnp.int32)).astype(dtype)[:, None]
-    draws = jax.random.normal(key, (len(drawn.ancestor), 5), dtype) * new
+    dtype, ancestor = particles.pose.dtype, drawn.ancestor
+    new = (ancestor != jnp.arange(len(ancestor), dtype=jnp.int32)).astype(dtype)[:, None]
+    draws = jax.random.normal(key, (len(ancestor), 5), dtype) * new
     rate = particles.heading_rate
     if rate is not None:
         changes = jax.random.normal(jax.random.fold_in(key, RATE_STREAM), new.shape[:1], dtype)
-        rate = rate[drawn.ancestor] + config.heading_rate * new[:, 0] * changes
+        rate = rate[ancestor] + config.heading_rate * new[:, 0] * changes
     spread = jnp.array([config.length, config.length, config.heading], dtype)
-    return Particles(
-        particles.pose[drawn.ancestor] + spread[None] * draws[:, :3],
-        particles.session[drawn.ancestor] + config.scale * draws[:, 3:],
-        particles.move[drawn.ancestor],
-        jnp.zeros_like(particles.weight),
-        rate,
-    )
+    pose = particles.pose[ancestor] + spread[None] * draws[:, :3]
+    session = particles.session[ancestor] + config.scale * draws[:, 3:]
+    return Particles(pose, session, particles.move[ancestor], jnp.zeros_like(particles.weight), rate)
 
 
 def copy_rows(rows: Array, drawn: Resampling) -> Array:

@@ -23,7 +23,7 @@ from ratslam.mapping.archive import Archive
 from ratslam.mapping.closure_judge import AT_ONCE, judge_sequences
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import CONFIRMED_WEIGHT, Candidate, ClosureLog, Verdict
-from ratslam.mapping.map_solution import MapSolution, cheapest_map, solved_map
+from ratslam.mapping.map_solution import MapSolution, cheapest_map
 from ratslam.mapping.odometry_scan import OdometryScan
 from ratslam.mapping.optimizer import CalibrationPrior
 from ratslam.mapping.verification import break_odometry, judge_by_map, map_distance, spans
@@ -46,7 +46,7 @@ class Acceptance(Checkpointed, ABC):
 
     def solution(self, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
         """The map as it would be if the session ended now; leaves graph and log unchanged."""
-        return solved_map(graph, log)
+        return MapSolution.solved(graph, log)
 
 
 class AcceptByEvidence(Acceptance):
@@ -95,16 +95,12 @@ LEAST_TURN_ERROR = 0.002
 
 
 def vote(
-    grid: np.ndarray,
-    prior: CalibrationPrior,
-    log_ratios: np.ndarray,
-    score_odds: np.ndarray,
-    least_bias_sd: float,
+    grid: np.ndarray, prior: CalibrationPrior, log_ratios: np.ndarray, score_odds: np.ndarray, least_sd: float
 ) -> tuple[CalibrationPrior, CalibrationPrior, np.ndarray]:
     """The vote of R sequences on the calibrations of `grid` [G, 2], rad/m and rad/rad.
 
     Args:
-        log_ratios: [R, G] of `OdometryScan`. score_odds: [R] log odds by their scores. least_bias_sd: least
+        log_ratios: [R, G] of `OdometryScan`. score_odds: [R] log odds by their scores. least_sd: least
             standard deviation of the belief in the bias, rad/m.
 
     Returns:
@@ -120,14 +116,12 @@ def vote(
     others = total - votes
     others = others - _log_sum(others)[:, None]
     share = np.exp(total - _log_sum(total))
-    bias, bias_mean, bias_sd = _belief(share, grid[:, 0], prior.bias, least_bias_sd)
+    bias, bias_mean, bias_sd = _belief(share, grid[:, 0], prior.bias, least_sd)
     turn, turn_mean, turn_sd = _belief(share, grid[:, 1], prior.turn_error, LEAST_TURN_ERROR)
     turn_sd = turn_sd if prior.turn_error_sd > 0 else 0.0
-    return (
-        CalibrationPrior(bias, bias_sd, turn, turn_sd),
-        CalibrationPrior(bias_mean, bias_sd, turn_mean, turn_sd),
-        score_odds + _log_sum(others + log_ratios),
-    )
+    belief = CalibrationPrior(bias, bias_sd, turn, turn_sd)
+    mean = CalibrationPrior(bias_mean, bias_sd, turn_mean, turn_sd)
+    return belief, mean, score_odds + _log_sum(others + log_ratios)
 
 
 def _log_sum(values: np.ndarray) -> np.ndarray:
@@ -137,16 +131,14 @@ def _log_sum(values: np.ndarray) -> np.ndarray:
     return largest + np.log(np.exp(values - largest[..., None]).sum(axis=-1))
 
 
-def _belief(
-    share: np.ndarray, values: np.ndarray, prior: float, least_sd: float
-) -> tuple[float, float, float]:
+def _belief(share: np.ndarray, values: np.ndarray, prior: float, least: float) -> tuple[float, float, float]:
     """Mean of values [G] with weights [G], shrunk towards the prior's; the mean itself; and the standard
     deviation about the shrunk mean."""
     mean = float(share @ values)
     sd = float(np.sqrt(share @ (values - mean) ** 2))
     off = mean - prior
     kept = prior + (off * max(0.0, 1 - (SHRINK * sd / off) ** 2) if off else 0.0)
-    return kept, mean, max(float(np.hypot(sd, mean - kept)), least_sd)
+    return kept, mean, max(float(np.hypot(sd, mean - kept)), least)
 
 
 _Vote = tuple[np.ndarray, np.ndarray, CalibrationPrior, CalibrationPrior, np.ndarray]
@@ -206,7 +198,7 @@ class AcceptByOdds(Acceptance):
                     break
                 graph.optimise(log)
         if not len(log.accepted_rows()):
-            return solved_map(graph, log)
+            return MapSolution.solved(graph, log)
         return cheapest_map(graph, log, [mean, graph.prior])
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:

@@ -53,6 +53,10 @@ NEUTRAL_IMAGE_MISFIT = float(np.log(2))
 """Misfit of a whisker image without evidence."""
 
 
+Normalise = Callable[[np.ndarray], np.ndarray]
+"""The preprocessing of views that recall uses."""
+
+
 class ViewMetric(NamedTuple):
     """The metric of recall; see `MapFeedback`."""
 
@@ -154,9 +158,7 @@ class ViewAppearance(Appearance):
     VALUES = ("_scale",)
     PARTS = ("_fan",)
 
-    def __init__(
-        self, size: int, fan: float | None, normalise: Callable[[np.ndarray], np.ndarray] = np.asarray
-    ) -> None:
+    def __init__(self, size: int, fan: float | None, normalise: Normalise = np.asarray) -> None:
         self._normalise = normalise
         self._fan = None if fan is None or not size else SectorFan(size, fan / size)
         self._view = GrowableArray((size,), np.float64)
@@ -280,11 +282,7 @@ class WhiskerAppearance(_LearnedAppearance):
     JUDGED = True
 
     def __init__(
-        self,
-        pixels: PixelLayout,
-        temper: float,
-        normalise: Callable[[np.ndarray], np.ndarray] = np.asarray,
-        half_turns: bool = True,
+        self, pixels: PixelLayout, temper: float, normalise: Normalise = np.asarray, half_turns: bool = True
     ) -> None:
         super().__init__(temper, np.pi if half_turns else 0.0)
         self.layout, self._normalise = pixels, normalise
@@ -303,11 +301,9 @@ class WhiskerAppearance(_LearnedAppearance):
         self._likeness = log_odds_table(estimate_background(images, self.layout.group), variation)
 
     def learned_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
-        pixels, frames = self.layout, np.broadcast_to(frame, len(others))
-        images = self._level.rows
-        return summed_log_odds(
-            self._likeness, pixels.group, images, pixels.opposite, frames, others, reversed
-        )
+        (group, opposite), images = self.layout, self._level.rows
+        frames = np.broadcast_to(frame, len(others))
+        return summed_log_odds(self._likeness, group, images, opposite, frames, others, reversed)
 
 
 @compiled
@@ -350,14 +346,12 @@ def summed_log_odds(
 
 
 @compiled
-def near_facing(
-    poses: np.ndarray, frames: np.ndarray, guard: int, radius: float, facing: float
-) -> np.ndarray:
+def near_facing(poses: np.ndarray, frames: np.ndarray, guard: int, reach: float, facing: float) -> np.ndarray:
     """[F, N] int8: for each of the keyframes `frames` [F], which older ones are near it: 1 those that face
     alike, -1 those that face the opposite way, 0 all others.
 
     Args:
-        poses: [N, 3]. guard: number of newest keyframes before each that do not count. radius: largest
+        poses: [N, 3]. guard: number of newest keyframes before each that do not count. reach: largest
             distance, m. facing: least cosine of the difference in heading, or in opposite headings.
     """
     ahead, aside = np.cos(poses[:, 2]), np.sin(poses[:, 2])
@@ -366,7 +360,7 @@ def near_facing(
         k = frames[row]
         for other in range(k - guard):
             dx, dy = poses[other, 0] - poses[k, 0], poses[other, 1] - poses[k, 1]
-            if dx * dx + dy * dy < radius * radius:
+            if dx * dx + dy * dy < reach * reach:
                 cosine = ahead[other] * ahead[k] + aside[other] * aside[k]
                 if abs(cosine) > facing:
                     found[row, other] = 1 if cosine > 0 else -1

@@ -181,11 +181,8 @@ class UnmergedMap(Checkpointed):
         graph.heading_noise = selected.noise
         rest = np.arange(size, count)
         number = np.arange(len(self.kept), len(self.kept) + len(rest))
-        return Merge(
-            np.concatenate([self.kept, rest]),
-            np.concatenate([self.onto, number]),
-            np.concatenate([self.offset, np.zeros((len(rest), 3))]),
-        )
+        kept, onto = np.concatenate([self.kept, rest]), np.concatenate([self.onto, number])
+        return Merge(kept, onto, np.concatenate([self.offset, np.zeros((len(rest), 3))]))
 
 
 class _ArchiveSelection(Checkpointed):
@@ -233,16 +230,25 @@ class KeyframeMerger(Checkpointed):
             return None
         unmerged = self.archive_selection.job.take(graph.total)
         if unmerged is not None and unmerged.selected.found:
-            return self._replace(unmerged, graph, log, selection, experiences)
+            archive = self._archive
+            taken, row = graph.taken.rows.copy(), archive.row.rows.copy()
+            merge = unmerged.replace(graph, log, archive)
+            archive.row.replace(merge.onto)
+            archive.offset.replace(merge.offset)
+            selection.hypotheses = unmerged.selected.hypotheses
+            _merge(merge, graph, log, selection)
+            graph.optimise(log)
+            source, onto = row[merge.kept], merge.onto[taken]
+            experiences.merge(source, onto, merge.offset[taken])
+            return MergedRows(source, *graph.appearance.stored(merge.kept), onto, merge.offset[taken])
         if not self.merge_due or self.archive_selection.job.busy:
             return None
         self.merge_due = False
-        merge = self.merge_all(graph, log, selection, graph.config.merge_newest)
-        if merge is None:
+        found = self.merge_all(graph, log, selection, graph.config.merge_newest)
+        if found is None:
             return None
-        experiences.merge(merge.kept, merge.onto, merge.offset)
-        views = graph.appearance.stored(graph.taken.rows)
-        return MergedRows(merge.kept, *views, merge.onto, merge.offset)
+        experiences.merge(*found)
+        return MergedRows(found.kept, *graph.appearance.stored(graph.taken.rows), found.onto, found.offset)
 
     def merge_all(
         self, graph: KeyframeGraph, log: ClosureLog, selection: SelectionWorker, newest: int
@@ -253,26 +259,6 @@ class KeyframeMerger(Checkpointed):
             self._archive.merge(merge, graph, log)
             _merge(merge, graph, log, selection)
         return merge
-
-    def _replace(
-        self,
-        unmerged: UnmergedMap,
-        graph: KeyframeGraph,
-        log: ClosureLog,
-        selection: SelectionWorker,
-        experiences: Experiences,
-    ) -> MergedRows:
-        archive = self._archive
-        taken, row = graph.taken.rows.copy(), archive.row.rows.copy()
-        merge = unmerged.replace(graph, log, archive)
-        archive.row.replace(merge.onto)
-        archive.offset.replace(merge.offset)
-        selection.hypotheses = unmerged.selected.hypotheses
-        _merge(merge, graph, log, selection)
-        graph.optimise(log)
-        source, onto = row[merge.kept], merge.onto[taken]
-        experiences.merge(source, onto, merge.offset[taken])
-        return MergedRows(source, *graph.appearance.stored(merge.kept), onto, merge.offset[taken])
 
 
 def _merge(merge: Merge, graph: KeyframeGraph, log: ClosureLog, selection: SelectionWorker) -> None:

@@ -18,13 +18,7 @@ import numpy as np
 
 from ratslam.core.arrays import GrowableArray
 from ratslam.core.compiled import compiled
-from ratslam.mapping.closure_selection import (
-    CUT,
-    MapHypotheses,
-    Selection,
-    SelectionProblem,
-    optimise_with_cuts,
-)
+from ratslam.mapping.closure_selection import CUT, MapHypotheses, Selection, SelectionProblem
 from ratslam.mapping.ground import BINS, GainOdds, learn_gain_odds
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
@@ -160,7 +154,7 @@ def _score(
     Args:
         fits: [N, S, N], see `view_fits`. odds: the same for all maps that are compared.
     """
-    selections = [optimise_with_cuts(case.problem, start, case.breaks) for start in starts]
+    selections = [case.problem.with_cuts(start, case.breaks) for start in starts]
     likelihoods = [_likelihood(graph, fits, odds, case, one.fit) for one in selections]
     selection, aligned = selections[int(np.argmax(likelihoods))], case
     for _ in range(ALIGNED):
@@ -168,7 +162,7 @@ def _score(
         log, session = case.log.copy(), SelfTraverse.of_map(graph, selection.fit, fits)
         add_closures_along(log, session, case.cuts, graph.config.max_gap)
         aligned = _carried_problem(graph, log, case.cuts)
-        selection = optimise_with_cuts(aligned.problem, selection.fit, aligned.breaks)
+        selection = aligned.problem.with_cuts(selection.fit, aligned.breaks)
     return _likelihood(graph, fits, odds, case, selection.fit), selection, aligned, case
 
 

@@ -27,7 +27,7 @@ from scipy.special import expit
 
 from ratslam.core.arrays import GrowableArray
 from ratslam.core.compiled import compiled
-from ratslam.mapping.ground import DEVIATIONS, MOST_REACH, MOST_REACH_HEADING, REACH, REACH_HEADING
+from ratslam.mapping.ground import MOST_REACH, MOST_REACH_HEADING, REACH, REACH_HEADING, grown_reaches
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
 from ratslam.mapping.odometry_scan import log_ratio
@@ -70,13 +70,10 @@ class SequenceEvidence(NamedTuple):
 
     def features(self) -> np.ndarray:
         """[n, 2, 3 + 2 KINDS] factors of the weights, over the map and over the older pass."""
-        n = len(self.odometry_ratio)
-        ratio = np.column_stack(
-            [np.ones(n), np.maximum(self.odometry_ratio, 0), np.minimum(self.odometry_ratio, 0)]
-        )
-        return np.concatenate(
-            [np.repeat(ratio[:, None], 2, axis=1), self.counts.reshape(n, 2, 2 * KINDS)], axis=2
-        )
+        ratio, n = self.odometry_ratio, len(self.odometry_ratio)
+        first = np.column_stack([np.ones(n), np.maximum(ratio, 0), np.minimum(ratio, 0)])
+        counts = self.counts.reshape(n, 2, 2 * KINDS)
+        return np.concatenate([np.repeat(first[:, None], 2, axis=1), counts], axis=2)
 
     def log_odds(self, weights: np.ndarray) -> np.ndarray:
         """[n] L; NaN where nothing is said. weights: see `shipped_weights`."""
@@ -102,7 +99,7 @@ def judge_sequences(
     """
     if not graph.appearance.JUDGED or graph.config.may_be_carried:
         return np.full(len(sequences), np.nan)
-    return sequence_evidence(graph, fit, log, cut, sequences).log_odds(shipped_weights())
+    return sequence_evidence(graph, fit, log, cut, sequences, BEYOND).log_odds(shipped_weights())
 
 
 def judge_anew(graph: KeyframeGraph, log: ClosureLog, sequences: np.ndarray) -> None:
@@ -121,12 +118,7 @@ def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: G
 
 
 def sequence_evidence(
-    graph: KeyframeGraph,
-    fit: MapFit,
-    log: ClosureLog,
-    cut: GrowableArray,
-    sequences: np.ndarray,
-    after: int = BEYOND,
+    graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, after: int
 ) -> SequenceEvidence:
     """The evidence for sequences [n], each with a candidate or more, in a map of N keyframes.
 
@@ -138,10 +130,8 @@ def sequence_evidence(
     ways = _ways(graph, log, cut, sequences, after)
     # Odometry into each keyframe without its systematic errors, and poses by odometry alone.
     motion = correct_heading(graph.motion.rows, graph.length.rows, fit.bias, fit.turn_error)
-    variance, reckoned = (
-        graph.own_variances(),
-        graph.dead_reckoned(graph.start.bias, graph.start.turn_error),
-    )
+    variance = graph.own_variances()
+    reckoned = graph.dead_reckoned(graph.start.bias, graph.start.turn_error)
     asked = np.zeros(graph.count, bool)
     for way in ways.values():
         asked[way.low : way.high] = True
@@ -156,9 +146,8 @@ def sequence_evidence(
         ratio = log_ratio(x, y, heading, between, i, j, -turn, gate, apart)
         found.odometry_ratio[k] = float(np.clip(ratio, LEAST, MOST))
         reach = EXTENT + way.last - way.first + BEYOND
-        older = slice(
-            max(way.match - reach, 0), max(min(way.match + reach, way.middle - graph.guard), way.match) + 1
-        )
+        end = max(min(way.match + reach, way.middle - graph.guard), way.match) + 1
+        older = slice(max(way.match - reach, 0), end)
         before = max(way.first - graph.guard, way.match) + 1
         moved = motion[way.low : way.high], variance[way.low : way.high]
         for g, (ground, begins) in enumerate(((fit.poses[:before], 0), (reckoned[older], older.start))):
@@ -196,9 +185,8 @@ def _ways(
             first, last = int(rows[0, 0]), int(rows[-1, 0])
             low = max(first - BEYOND, int(breaks[part - 1]) if part else 0)
             high = min(last + after + 1, int(breaks[part]) if part < len(breaks) else graph.count)
-            ways[k] = _Way(
-                middle, match, -shift * graph.sector_angle, low, high, max(first, low), min(last, high - 1)
-            )
+            turn = -shift * graph.sector_angle
+            ways[k] = _Way(middle, match, turn, low, high, max(first, low), min(last, high - 1))
     return ways
 
 
@@ -378,8 +366,7 @@ def _follow(
                 _move(pose, motion[row], onwards)
                 place += variance[row, 0] + heading * (motion[row, 0] ** 2 + motion[row, 1] ** 2)
                 heading += variance[row, 2]
-            far = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
-            turn = min(reach_heading + DEVIATIONS * np.sqrt(heading), MOST_REACH_HEADING * reach_heading)
+            far, turn = grown_reaches(reach, reach_heading, place, heading)
             best, off, on_way = _compare_view(pose, near, frame, far, turn, (reach / 2, reach_heading / 2))
             seen = pose.copy()
             if best > 0:  # Kalman update, position and heading apart

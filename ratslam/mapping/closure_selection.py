@@ -39,6 +39,10 @@ COST_TOLERANCE = 0.5
 """Difference in cost, chi-square, below which two cuts count as equally good."""
 
 
+Cuts = tuple[tuple[int, int], ...]
+"""Of the odometry: the keyframe after each cut, and the sequence that shows it."""
+
+
 class SelectionProblem(NamedTuple):
     """The sequences to select from, and the odometry.
 
@@ -57,14 +61,21 @@ class SelectionProblem(NamedTuple):
     views_cost: Callable[[np.ndarray], float]
     place: Place = np.copy
 
+    def with_cuts(self, start: MapFit, cuts: Cuts, system: System | None = None) -> Selection:
+        """The fit and its cost with these cuts, from the poses and bias of `start`; system: of the
+        measurements with the cuts, where it is known."""
+        system = system or System(self.measurements.cut_at([frame for frame, _ in cuts]))
+        fit = system.solve(start, STEPS, FINE)
+        cost = system.robust_cost(fit) + self.views_cost(fit.poses)
+        return Selection(fit, cost + CUT * len(cuts), cuts)
+
 
 class Selection(NamedTuple):
-    """The best map found: its fit with a weight for each sequence, its cost (chi-square), and the cuts of
-    the odometry: (keyframe after the cut, sequence that shows it)."""
+    """The best map found: its fit with a weight for each sequence, its cost (chi-square), and its cuts."""
 
     fit: MapFit
     cost: float
-    cuts: tuple[tuple[int, int], ...]
+    cuts: Cuts
 
 
 FindCut = Callable[[np.ndarray, np.ndarray, np.ndarray, int], int]
@@ -87,11 +98,11 @@ def select_closures(case: SelectionProblem, starts: Sequence[MapFit]) -> Selecti
         the cheapest of the optimised maps.
     """
     system = System(case.measurements)
-    return min((_optimise(case, system, start, ()) for start in starts), key=lambda found: found.cost)
+    return min((case.with_cuts(start, (), system) for start in starts), key=lambda found: found.cost)
 
 
 def select_closures_and_cuts(
-    case: SelectionProblem, starts: Sequence[MapFit], find: FindCut, earlier: tuple[tuple[int, int], ...] = ()
+    case: SelectionProblem, starts: Sequence[MapFit], find: FindCut, earlier: Cuts = ()
 ) -> Selection:
     """The selection with the least cost for a robot that may be carried: with cuts of the odometry.
 
@@ -109,12 +120,11 @@ def select_closures_and_cuts(
     """
     best = select_closures(case, starts)
     if earlier:
-        best = min(optimise_with_cuts(case, starts[0], earlier), best, key=lambda found: found.cost)
+        best = min(case.with_cuts(starts[0], earlier), best, key=lambda found: found.cost)
     while True:
         strain = _strain(case, best)
-        strained = [
-            sequence for sequence in np.argsort(-strain)[:TRIALS].tolist() if strain[sequence] >= MIN_STRAIN
-        ]
+        tried = np.argsort(-strain)[:TRIALS]
+        strained = tried[strain[tried] >= MIN_STRAIN].tolist()
         found = [selection for sequence in strained for selection in _cut(case, best, sequence, find)]
         if not found:
             return best
@@ -152,12 +162,8 @@ def _strain(case: SelectionProblem, best: Selection) -> np.ndarray:
 
 def _claim(best: Selection, closures: LoopClosures, frame: int, sequence: int | None = None) -> np.ndarray:
     """[3] pose of a keyframe by its closures alone; without any, its pose in the map."""
-    among = closures.j == frame
-    among &= (
-        (closures.sequence == sequence)
-        if sequence is not None
-        else (best.fit.weights > ACCEPTED_WEIGHT)[closures.sequence]
-    )
+    accepted = (best.fit.weights > ACCEPTED_WEIGHT)[closures.sequence]
+    among = (closures.j == frame) & (accepted if sequence is None else closures.sequence == sequence)
     if not among.any():
         return best.fit.poses[frame]
     member = int(np.flatnonzero(among)[0])
@@ -180,7 +186,7 @@ def _cut(case: SelectionProblem, best: Selection, sequence: int, find: FindCut) 
     claimed = _claim(best, case.measurements.closures, first, sequence)
     frame, moved = _carry(case, best, since, first, claimed, poses, find)
     cuts = (*best.cuts, (frame, sequence))
-    found = [optimise_with_cuts(case, best.fit._replace(poses=moved), cuts)]
+    found = [case.with_cuts(best.fit._replace(poses=moved), cuts)]
     accepted = best.fit.weights > ACCEPTED_WEIGHT
     later = np.flatnonzero(accepted & (case.first > case.last[sequence]))
     if accepted[sequence] or not len(later):
@@ -189,7 +195,7 @@ def _cut(case: SelectionProblem, best: Selection, sequence: int, find: FindCut) 
     end, back = int(case.last[sequence]), int(case.first[following])
     again, twice = _carry(case, best, end, back, poses[back], moved, find)
     twice[back:] = poses[back:]
-    return [*found, optimise_with_cuts(case, best.fit._replace(poses=twice), (*cuts, (again, following)))]
+    return [*found, case.with_cuts(best.fit._replace(poses=twice), (*cuts, (again, following)))]
 
 
 def _carry(
@@ -213,19 +219,6 @@ def _carry(
     moved[first + 1 :] = compose(compose(onwards[-1], inverse(poses[first])), poses[first + 1 :])
     moved[frame:] = compose(carried, moved[frame:])
     return frame, moved
-
-
-def optimise_with_cuts(case: SelectionProblem, start: MapFit, cuts: tuple[tuple[int, int], ...]) -> Selection:
-    """The fit and its cost with these cuts (keyframe, sequence), from the poses and bias of `start`."""
-    return _optimise(case, System(case.measurements.cut_at([frame for frame, _ in cuts])), start, cuts)
-
-
-def _optimise(
-    case: SelectionProblem, system: System, start: MapFit, cuts: tuple[tuple[int, int], ...]
-) -> Selection:
-    fit = system.solve(start, STEPS, FINE)
-    cost = system.robust_cost(fit) + case.views_cost(fit.poses)
-    return Selection(fit, cost + CUT * len(cuts), cuts)
 
 
 KEPT = 4
@@ -287,11 +280,8 @@ class MapHypotheses(Checkpointed):
         self.poses = self.poses[:, merge.kept[merge.kept < self.poses.shape[1]]]
 
     def _fits(self, count: int) -> list[MapFit]:
-        weights = np.ones(count)
-        return [
-            MapFit(poses, bias, weights, turn_error)
-            for poses, (bias, turn_error) in zip(self.poses, self._calibration.tolist(), strict=True)
-        ]
+        weights, maps = np.ones(count), zip(self.poses, self._calibration.tolist(), strict=True)
+        return [MapFit(poses, bias, weights, turn_error) for poses, (bias, turn_error) in maps]
 
 
 def _branch(fits: list[MapFit], case: SelectionProblem, known: np.ndarray, new: int) -> list[MapFit]:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
-from ratslam.recall.config import RecallConfig, sector_shifts
+from ratslam.core.compiled import compiled
 from tactile.base.se2 import compose, inverse, wrap
 
 REACH = 1.2
@@ -56,6 +56,19 @@ class Ground(NamedTuple):
     reach_heading: float
     variance: np.ndarray
     near_share: float = NEAR
+
+    @classmethod
+    def of(
+        cls, poses: np.ndarray, shift: np.ndarray, cell: float, turn: float, variance: np.ndarray, near: float
+    ) -> Ground:
+        """Keyframes at these poses [N, 3] as ground.
+
+        Args:
+            shift: [S] sector shifts. cell: size of a pose cell, m. turn: per sector shift, rad. near:
+                `near_share`.
+        """
+        turns, least = -shift * turn, 0.6 * abs(turn) if len(shift) > 2 else 0.0
+        return cls(poses, turns, REACH * cell, max(REACH_HEADING, least), variance, near)
 
     def near(self, pose: np.ndarray, reach: float, reach_heading: float) -> tuple[np.ndarray, np.ndarray]:
         """The sector shifts [n] and keyframes [n] at which a robot at `pose` [3] is compared.
@@ -113,25 +126,6 @@ class Ground(NamedTuple):
         """Number of poses that can be told apart: keyframes within reach of each other count as one."""
         density = [len(self.near(pose, self.reach, self.reach_heading)[0]) for pose in self.poses]
         return float((len(self.turns) / np.maximum(density, 1)).sum())
-
-
-def ground_of(
-    poses: np.ndarray,
-    recall: RecallConfig,
-    cell: float,
-    sector_angle: float,
-    variance: np.ndarray,
-    near_share: float = NEAR,
-) -> Ground:
-    """Keyframes at these poses [N, 3] as ground.
-
-    Args:
-        cell: size of a pose cell, m. sector_angle: turn per sector shift, rad.
-        variance, near_share: see `Ground`.
-    """
-    turns = -sector_shifts(recall) * sector_angle
-    least = 0.6 * abs(sector_angle) if len(turns) > 2 else 0.0
-    return Ground(poses, turns, REACH * cell, max(REACH_HEADING, least), variance, near_share)
 
 
 DEVIATIONS = 2.0
@@ -254,6 +248,14 @@ def advance_all(
     return PoseHypothesis(pose, covariance), best
 
 
+@compiled
+def grown_reaches(reach: float, reach_heading: float, place: float, heading: float) -> tuple[float, float]:
+    """The reaches, m and rad, of a pose with these variances of position and heading, from those of the
+    ground; for compiled loops."""
+    far = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
+    return far, min(reach_heading + DEVIATIONS * np.sqrt(heading), MOST_REACH_HEADING * reach_heading)
+
+
 def _reaches(ground: Ground, position: Any, heading: Any) -> tuple[Any, Any]:
     """The reaches, m and rad, of a pose with these standard deviations."""
     reach = np.minimum(ground.reach + DEVIATIONS * position, MOST_REACH * ground.reach)
@@ -309,10 +311,8 @@ def learn_gain_odds(true: np.ndarray, false: np.ndarray, prior: GainPrior = PRIO
     low, high = np.clip(np.quantile(pooled, [0.005, 0.995]), -FARTHEST, FARTHEST).tolist()
     edges = np.linspace(low, high, BINS - 1)
     same, other = _density(edges, true, prior_true), _density(edges, false, prior_false)
-    mixed_same, mixed_other = (
-        (1 - OUTLIERS) * same + OUTLIERS * other,
-        (1 - OUTLIERS) * other + OUTLIERS * same,
-    )
+    mixed_same = (1 - OUTLIERS) * same + OUTLIERS * other
+    mixed_other = (1 - OUTLIERS) * other + OUTLIERS * same
     tiny = np.finfo(float).tiny  # a bin without counts has no odds
     raw = np.log((mixed_same + tiny) / (mixed_other + tiny))
     # A better fit is never evidence against a place; bins without gains say little.
@@ -352,9 +352,7 @@ class LearnedOdds(Checkpointed):
             row = int(known[0])
             return GainOdds(self.edges.rows[row], self.odds.rows[row], float(self.expected.rows[row]))
         found = learn()
-        self.ground.append(ground)
-        for array, values in zip((self.edges, self.odds, self.expected), found, strict=True):
-            array.append(values)
+        self._append_row(ground, *found)
         return found
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -364,13 +362,12 @@ class LearnedOdds(Checkpointed):
         if arrays:
             super().restore(arrays)
         else:
-            for array in (self.ground, self.edges, self.odds, self.expected):
-                array.replace(array.rows[:0])
+            self._take_rows(slice(0))
 
 
 COMMON = 0.5
 """Factor on the logarithm of a view's mean likelihood over the whole ground, subtracted from its gains."""
-COMMON_OF_PIECE = 0.25
+PIECE_COMMON = 0.25
 """The same factor for a piece of a growing map."""
 
 
@@ -396,9 +393,7 @@ def less_where_common(gain: np.ndarray, share: float = COMMON) -> np.ndarray:
 
 MAP_WEIGHTING = GainWeighting(np.asarray, PRIOR, 1.0)
 """For two pieces of finished maps, of which many keyframes are compared."""
-PIECE_WEIGHTING = GainWeighting(
-    partial(less_where_common, share=COMMON_OF_PIECE), ((2.4, 0.8), (1.0, 1.6)), 1.5
-)
+PIECE_WEIGHTING = GainWeighting(partial(less_where_common, share=PIECE_COMMON), ((2.4, 0.8), (1.0, 1.6)), 1.5)
 """For the newest piece of a growing map."""
 SESSION_WEIGHTING = GainWeighting(less_where_common, ((2.95, 0.8), (1.55, 1.6)), 2.0)
 """For a session of which few keyframes are known."""

@@ -19,7 +19,7 @@ from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.appearance import Appearance
 from ratslam.mapping.config import Ablation, KeyframeMapConfig
 from ratslam.mapping.loop_closures import ClosureLog
-from ratslam.mapping.odometry_calibration import learn_heading_noise, starting_calibration, starting_noise
+from ratslam.mapping.odometry_calibration import HeadingNoise, learn_heading_noise, starting_calibration
 from ratslam.mapping.optimizer import (
     LOOSE,
     NO_LINKS,
@@ -79,7 +79,7 @@ class KeyframeGraph(Checkpointed):
         self.links = NO_LINKS
         self.start = self.prior = starting_calibration(config, cell)
         self.bias, self.turn_error = self.prior.bias, self.prior.turn_error
-        self.heading_noise = starting_noise(config)
+        self.heading_noise = HeadingNoise.of_start(config)
         self.reckoned = np.zeros(3)
 
     @property
@@ -113,36 +113,23 @@ class KeyframeGraph(Checkpointed):
     def append(self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float) -> None:
         """Adds a keyframe at `pose` [3], reached by `motion` [3]."""
         self.reckoned = self.reckoned_after(motion, length) if self.count else np.array(pose, float)
-        self._append(pose, motion, length, turn, begins=False)
+        self._append_row(pose, motion, length, turn, -1, False, False, self.total)
 
     def begin_piece(self) -> None:
         """Adds a keyframe to which no odometry leads, as the start of a new piece (`piece_placement`); an
         empty graph gets its first keyframe."""
         self.reckoned = self.next_start()
         motion = between(self.pose.rows[-1], self.reckoned) if self.count else np.zeros(3)
-        self._append(self.reckoned, motion, 0.0, 0.0, begins=self.count > 0)
+        self._append_row(self.reckoned, motion, 0.0, 0.0, -1, self.count > 0, False, self.total)
 
     def append_newest(self, other: KeyframeGraph) -> None:
         """Adds the newest keyframe of another graph."""
-        for name, array in self._growable_arrays().items():
-            array.append(getattr(other, name).rows[-1])
+        self._append_row(*(array.rows[-1] for array in other._growable_arrays().values()))
         self.reckoned = other.reckoned
 
     def next_start(self) -> np.ndarray:
         """[3] the pose of the next keyframe if it begins a piece."""
         return piece_start(int(self.begins.rows.sum()) + min(self.count, 1), self.cell)
-
-    def _append(
-        self, pose: np.ndarray, motion: np.ndarray, length: float, turn: float, *, begins: bool
-    ) -> None:
-        self.taken.append(self.total)
-        self.pose.append(pose)
-        self.motion.append(motion)
-        self.length.append(length)
-        self.turn.append(turn)
-        self.cut.append(-1)
-        self.begins.append(begins)
-        self.seam.append(False)
 
     def replace(self, other: KeyframeGraph, poses: np.ndarray, cut: np.ndarray) -> None:
         """Takes over all keyframes of a graph without links, with other poses [N, 3] and breaks [N]."""
@@ -154,8 +141,7 @@ class KeyframeGraph(Checkpointed):
 
     def take(self, rows: np.ndarray) -> None:
         """Reduces all arrays to the keyframes `rows` [n]; links are not touched."""
-        for array in self._growable_arrays().values():
-            array.replace(array.rows[rows])
+        self._take_rows(rows)
 
     def pose_after(self, motion: np.ndarray, length: float) -> np.ndarray:
         """[3] the pose after a motion [3] over a distance since the newest keyframe."""
@@ -280,9 +266,8 @@ class KeyframeGraph(Checkpointed):
             spare = (closures.score - config.sequence_cost) * closures.credit
             worth = 2 * np.maximum(spare, 1.0) / closures.size
             # A sequence must be able to cost more than its evidence, else it could never be refused.
-            return closures._replace(
-                scale=worth, cost_limit=np.maximum(config.closure_cost_limit, 1.5 * worth)
-            )
+            limit = np.maximum(config.closure_cost_limit, 1.5 * worth)
+            return closures._replace(scale=worth, cost_limit=limit)
         if not self.ablation.robust:
             return closures._replace(scale=np.full_like(closures.scale, NO_ROBUST_SCALE))
         return closures
@@ -324,7 +309,7 @@ class KeyframeGraph(Checkpointed):
 
     def learn_noise(self, fit: MapFit, log: ClosureLog) -> None:
         """Updates the noise of the odometry from a fit that solves the problem of the accepted closures."""
-        start, problem = starting_noise(self.config), self.problem(log, self.cut)
+        start, problem = HeadingNoise.of_start(self.config), self.problem(log, self.cut)
         self.heading_noise = learn_heading_noise(self.heading_noise, start, fit, problem)
 
     def map_covariance(self, log: ClosureLog) -> MapCovariance:
@@ -351,12 +336,10 @@ class KeyframeGraph(Checkpointed):
         zero = np.zeros(len(closures.i))
         turned = np.stack([zero, zero, closures.turn], axis=1)
         trust = log.weights()[:, None] / closures.variance
-        return Edges(
-            np.concatenate([steps, links.i, closures.i]),
-            np.concatenate([steps + 1, links.j, closures.j]),
-            np.concatenate([moved[steps], fit.corrected_links(links), turned]),
-            np.concatenate([1 / chain.variance[steps], 1 / links.variance, trust]),
-        )
+        i = np.concatenate([steps, links.i, closures.i])
+        j = np.concatenate([steps + 1, links.j, closures.j])
+        motion = np.concatenate([moved[steps], fit.corrected_links(links), turned])
+        return Edges(i, j, motion, np.concatenate([1 / chain.variance[steps], 1 / links.variance, trust]))
 
     def _loose_variance(self) -> np.ndarray:
         return np.array([LOOSE * self.cell, LOOSE * self.cell, LOOSE]) ** 2

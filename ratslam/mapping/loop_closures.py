@@ -17,9 +17,7 @@ import numpy as np
 from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.mapping.optimizer import LoopClosures
 
-CSV_COLUMNS = (
-    "keyframe,match,step,match_step,shift,posterior,log_ratio,sequence,distance,verdict,weight,log_odds"
-)
+HEADER = "keyframe,match,step,match_step,shift,posterior,log_ratio,sequence,distance,verdict,weight,log_odds"
 
 UNLIKELY = -1.5
 """Log-odds below which the evidence of a sequence counts less; true ones of a young session, or of one
@@ -298,9 +296,8 @@ class ClosureLog(Checkpointed):
 
     def judged(self) -> np.ndarray:
         """[n, 3] match, keyframe, and 1 where accepted, 0 where open, -1 where removed, of all candidates."""
-        sign = np.where(
-            self._candidate.rows[:, 3] < 0, -1, SIGNS[self._verdict.rows[self._candidate.rows[:, 3]]]
-        )
+        sequence = self._candidate.rows[:, 3]
+        sign = np.where(sequence < 0, -1, SIGNS[self._verdict.rows[sequence]])
         return np.column_stack([self._candidate.rows[:, 1::-1], sign])
 
     def accepted_middle_first(self) -> np.ndarray:
@@ -314,13 +311,11 @@ class ClosureLog(Checkpointed):
         ordered: np.ndarray = rows[order][np.argsort(off, kind="stable")]
         return ordered
 
-    def closures(
-        self, angle: float, variance: np.ndarray, scales: tuple[float, float, float]
-    ) -> LoopClosures:
+    def closures(self, angle: float, variance: np.ndarray, scale: tuple[float, float, float]) -> LoopClosures:
         """The accepted closures, for the optimiser.
 
         Args:
-            angle: turn per sector shift, rad. variance: [3] of a closure. scales: robust scale per unit of
+            angle: turn per sector shift, rad. variance: [3] of a closure. scale: robust scale per unit of
                 a sequence's evidence, least scale, largest scale.
         """
         rows = self._candidate.rows[self.accepted_rows()]
@@ -333,7 +328,7 @@ class ClosureLog(Checkpointed):
             turn=-rows[:, 2] * angle,
             sequence=sequence,
             variance=variance,
-            scale=np.clip(scales[0] * score, *scales[1:]),
+            scale=np.clip(scale[0] * score, *scale[1:]),
             score=score + merged[:, 0],
             size=np.bincount(sequence, minlength=len(sequences)) + merged[:, 1],
             credit=self.credit()[sequences],
@@ -369,7 +364,7 @@ class ClosureLog(Checkpointed):
 
 def write_closures(path: Path, table: np.ndarray, first_step: np.ndarray) -> None:
     """Writes the candidates of `ClosureLog.table` as CSV; first_step: [N] the step of each keyframe."""
-    lines = [CSV_COLUMNS]
+    lines = [HEADER]
     for frame, match, shift, posterior, ratio, sequence, distance, verdict, weight, odds in table.tolist():
         frame, match = int(frame), int(match)
         lines.append(

@@ -29,13 +29,7 @@ from ratslam.mapping.experiences import Experiences
 from ratslam.mapping.ground import LearnedOdds
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict, write_closures
-from ratslam.mapping.map_solution import (
-    DOUBTED,
-    MapSolution,
-    selected_solution,
-    solved_map,
-    worse_than_odometry,
-)
+from ratslam.mapping.map_solution import DOUBTED, MapSolution, selected_solution, worse_than_odometry
 from ratslam.mapping.odometry_calibration import calibration_from_views, write_calibration
 from ratslam.mapping.pose_graph import Edges, write_g2o, write_json
 from ratslam.mapping.selection_worker import SelectionWorker
@@ -217,7 +211,7 @@ class KeyframeMap(Checkpointed, Map):
         if self._kept is None:
             graph, log, selected = self._graph, self.log, None
             if not self.closes_loops:
-                found = solved_map(graph, log)
+                found = MapSolution.solved(graph, log)
             else:
                 if self.config.select_every:
                     selected = selected_solution(graph, log, deepcopy(self.selection.hypotheses))

@@ -40,12 +40,7 @@ from ratslam.mapping.closure_selection import (
 )
 from ratslam.mapping.keyframe_graph import KeyframeGraph, Place, number_pieces
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
-from ratslam.mapping.odometry_calibration import (
-    HeadingNoise,
-    learn_heading_noise,
-    log_posterior,
-    starting_noise,
-)
+from ratslam.mapping.odometry_calibration import HeadingNoise, learn_heading_noise, log_posterior
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, System, solve
 from ratslam.mapping.verification import find_break, spans
 from tactile.base.se2 import between, compose, inverse, wrap
@@ -124,6 +119,13 @@ class MapSolution(NamedTuple):
     log: ClosureLog
     cut: GrowableArray
 
+    @classmethod
+    def solved(cls, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
+        """The map with the closures accepted so far, optimised; dead reckoning without any."""
+        if len(log.accepted_rows()):
+            return cls(graph.solve(log, graph.config.settling), log, graph.cut)
+        return cls(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
+
     def placed(self, graph: KeyframeGraph) -> MapSolution:
         """The map with the pieces of `graph` where they belong, see `placed_pieces`; the fit may have moved
         them."""
@@ -180,13 +182,6 @@ class MapSolution(NamedTuple):
         return Obstacle.ONLY_LINK if np.any(self.cut.rows == sequence) else None
 
 
-def solved_map(graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
-    """The map with the closures accepted so far, optimised; dead reckoning without any."""
-    if len(log.accepted_rows()):
-        return MapSolution(graph.solve(log, graph.config.settling), log, graph.cut)
-    return MapSolution(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
-
-
 def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[CalibrationPrior]) -> MapSolution:
     """The map of least cost with the closures accepted so far, reached from the current poses and from dead
     reckoning with the mean of each of these calibrations. The log takes over its robust weights."""
@@ -220,7 +215,7 @@ def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypo
         selected = select_closures_and_cuts(problem, starts, partial(find_break, graph), earlier)
     else:
         selected = select_closures(problem, starts)
-        noise, start = graph.heading_noise, starting_noise(config)
+        noise, start = graph.heading_noise, HeadingNoise.of_start(config)
         if noise.log_factor - start.log_factor > NOISY * noise.sd:  # surely above that of the start
             reckoned = _dead_reckoned(graph, problem.measurements.prior, place)
             selected = reselect(problem, selected, reckoned, noise, start)
@@ -351,15 +346,10 @@ def health_features(graph: KeyframeGraph, solution: MapSolution) -> np.ndarray:
     reckoned = graph.dead_reckoned()
     of_map = _claims_ratio(graph, solution.fit.poses)
     of_odometry = _claims_ratio(graph, reckoned)
-    chain, poses = graph.odometry(solution.cut), solution.fit.poses
-    error = between(poses[:-1], poses[1:]) - solution.fit.corrected(chain)
-    error[:, 2] = wrap(error[:, 2])
-    sums = np.cumsum((error**2 / chain.variance).sum(axis=1))
+    sums, poses = np.cumsum(solution.fit.strain(graph.odometry(solution.cut))), solution.fit.poses
     window = sums[WINDOW:] - sums[:-WINDOW] if len(sums) > WINDOW else sums[-1:]
     strain = float(np.log10(max(window.max(initial=0.0), 0.0) + 1e-6))
-    unexplained, before = (
-        _unexplained(solution.log, each, graph.sector_angle, graph.cell) for each in (poses, reckoned)
-    )
+    unexplained, before = (_unexplained(graph, solution.log, each) for each in (poses, reckoned))
     return np.array([of_map - of_odometry, of_odometry, strain, strain * of_odometry, unexplained - before])
 
 
@@ -372,7 +362,7 @@ def _claims_ratio(graph: KeyframeGraph, poses: np.ndarray) -> float:
     return float(np.log((agreed + LEAST_CLAIMS) / (contradicted + LEAST_CLAIMS)))
 
 
-def _unexplained(log: ClosureLog, poses: np.ndarray, angle: float, cell: float) -> float:
+def _unexplained(graph: KeyframeGraph, log: ClosureLog, poses: np.ndarray) -> float:
     """Share of the evidence of refused sequences that poses [N, 3] do not explain."""
     table = log.table()
     table = table[table[:, 5] >= 0]
@@ -383,7 +373,8 @@ def _unexplained(log: ClosureLog, poses: np.ndarray, angle: float, cell: float) 
     worth = worth * np.maximum(table[:, 4], 0.0)
     j, i = table[:, :2].astype(int).T
     error = between(poses[i], poses[j])
-    error[:, 2] = wrap(error[:, 2] + table[:, 2] * angle)
-    apart = (error[:, 0] ** 2 + error[:, 1] ** 2) / (PLACE * cell) ** 2 + (error[:, 2] / HEADING) ** 2
+    error[:, 2] = wrap(error[:, 2] + table[:, 2] * graph.sector_angle)
+    far, turned = error[:, 0] ** 2 + error[:, 1] ** 2, error[:, 2] / HEADING
+    apart = far / (PLACE * graph.cell) ** 2 + turned**2
     lost = (worth * apart / (1 + apart)).sum()
     return float((lost + NEUTRAL / 2) / (worth.sum() + NEUTRAL))

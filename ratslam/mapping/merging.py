@@ -101,10 +101,7 @@ def _confirmed_ground(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
     sure &= ~broken
     sure[:-1] &= ~broken[1:]
     # Odometry from one keyframe to the next that is strained, or near such; never at seams, which are loose.
-    fit, chain = graph.fit(), graph.odometry(graph.cut)
-    error = between(fit.poses[:-1], fit.poses[1:]) - fit.corrected(chain)
-    error[:, 2] = wrap(error[:, 2])
-    tense = (error**2 / chain.variance).sum(axis=1) > TENSE
+    tense = graph.fit().strain(graph.odometry(graph.cut)) > TENSE
     tense = np.convolve(tense, np.ones(2 * AROUND + 1), "same") > 0.5
     sure[1:] &= ~tense
     sure[:-1] &= ~tense
@@ -150,14 +147,8 @@ def merge_keyframes(graph: KeyframeGraph, merge: Merge) -> None:
     mean = reference + _summed(group, information * off, len(pairs)) / total
     mean[:, 2] = wrap(mean[:, 2])
     by_heading = information[:, 2] / total[group, 2]
-    links = OdometryLinks(
-        pairs // size,
-        pairs % size,
-        mean,
-        np.bincount(group, by_heading * length[apart], len(pairs)),
-        np.bincount(group, by_heading * turn[apart], len(pairs)),
-        1 / total,
-    )
+    length, turn = (np.bincount(group, by_heading * each[apart], len(pairs)) for each in (length, turn))
+    links = OdometryLinks(pairs // size, pairs % size, mean, length, turn, 1 / total)
     skipped = take_keyframes(graph, merge.kept)
     graph.seam.rows[skipped] = True
     graph.links = links

@@ -51,19 +51,17 @@ class BlockPattern:
         return _BlockFactor((first, rows, blocks, inverse), float(logarithm)) if regular else None
 
 
-class _BlockFactor:
+class _BlockFactor(NamedTuple):
     """The factor L D L^T of a matrix: where its blocks stand, the blocks, the inverses of D; and the natural
     logarithm of the determinant of the matrix."""
 
-    def __init__(
-        self, parts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], log_determinant: float
-    ) -> None:
-        self._parts, self.log_determinant = parts, log_determinant
+    parts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    log_determinant: float
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """[n, 3, C] the solutions for the right-hand sides [n, 3, C], in the order of elimination."""
         solution = np.array(right, np.float64, order="C")
-        _solve_in_place(*self._parts, solution)
+        _solve_in_place(*self.parts, solution)
         return solution
 
 
@@ -238,9 +236,7 @@ def _solve_in_place(
 PI = float(np.pi)
 
 
-Measurements = tuple[
-    np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray
-]
+Measurements = tuple[np.ndarray, ...]
 """M relative poses of keyframes and what is known of them: keyframes i and j, [M] each; the measured pose
 [M, 3] of j in the frame of i (m, m, rad) and the information [M, 3] of it; distance (m) and turn (rad) [M, 2]
 by which heading bias and turn error bend it, 0 for closures; the positions [M] of i and of j in the order of

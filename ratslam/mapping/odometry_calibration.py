@@ -234,11 +234,6 @@ def calibration_from_views(
     return start._replace(bias=shrunk, bias_sd=float(sd))
 
 
-def starting_noise(config: KeyframeMapConfig) -> HeadingNoise:
-    """The noise of heading before any closure."""
-    return HeadingNoise(float(np.log(config.calibration.heading_noise)))
-
-
 def write_calibration(path: Path, calibration: CalibrationPrior, noise: HeadingNoise | None) -> None:
     """Writes means and standard deviations as settings of a configuration.
 
@@ -264,6 +259,11 @@ class HeadingNoise(NamedTuple):
 
     log_factor: float = 0.0
     sd: float = SPREAD
+
+    @classmethod
+    def of_start(cls, config: KeyframeMapConfig) -> HeadingNoise:
+        """The noise before any closure."""
+        return cls(float(np.log(config.calibration.heading_noise)))
 
     @property
     def factor(self) -> float:
@@ -291,9 +291,8 @@ def learn_heading_noise(
     off = noise.log_factor - start.log_factor
     system = System(problem)
     changed = [system.with_problem(problem.with_heading_noise(float(np.exp(step)))) for step in steps]
-    logs = np.array(
-        [log_posterior(off + step, at.solve(fit, STEPS), at) for step, at in zip(steps, changed, strict=True)]
-    )
+    pairs = zip(steps, changed, strict=True)
+    logs = np.array([log_posterior(off + step, at.solve(fit, STEPS), at) for step, at in pairs])
     if not np.isfinite(logs).all():
         return noise
     slope = (logs[2] - logs[0]) / (2 * LARGEST_STEP)

@@ -89,11 +89,8 @@ class OdometryScan:
         variance = np.ascontiguousarray(graph.variances(graph.cut)[i + 1 : j + 1, 1:])
         gate = (config.gate_sd * graph.cell) ** 2, config.gate_heading**2
         turned, old = shift * graph.sector_angle, max(j - graph.guard, 1)
-        ratios = np.full(len(self.grid), np.nan)
-        _compute_log_ratios(
-            self._path, self._total, self.grid, near, variance, i, j, turned, old, gate, ratios
-        )
-        return ratios
+        path, total = self._path, self._total
+        return _compute_log_ratios(path, total, self.grid, near, variance, i, j, turned, old, gate)
 
 
 @compiled
@@ -133,15 +130,15 @@ def _compute_log_ratios(
     turned: float,
     old: int,
     gate: tuple[float, float],
-    ratios: np.ndarray,
-) -> None:
-    """Writes the log ratios of a closure of keyframe j with keyframe i, see `OdometryScan.log_ratios`.
+) -> np.ndarray:
+    """[G] log ratios of a closure of keyframe j with keyframe i, see `OdometryScan.log_ratios`.
 
     Args:
         path, total: see `_extend_paths`. points: of the grid [G, 2]. variance: [j - i, 2] along and of
             heading into each keyframe between. turned: by which the match is turned, rad. old: number of
-            keyframes that could be recalled. gate: variance of position and heading added. ratios: [G].
+            keyframes that could be recalled. gate: variance of position and heading added.
     """
+    ratios = np.full(len(grid), np.nan)
     heading, apart = np.empty(j + 1), np.empty(old)
     measured, driven, net = total[: j + 1, 0].copy(), total[: j + 1, 1].copy(), total[: j + 1, 2].copy()
     for g in points:
@@ -150,6 +147,7 @@ def _compute_log_ratios(
             heading[k] = measured[k] + driven[k] * bias + net[k] * turn_error
         ratio = log_ratio(path[g, 0], path[g, 1], heading, variance, i, j, turned, gate, apart)
         ratios[g] = max(ratio, UNLIKELY)
+    return ratios
 
 
 @compiled

@@ -24,7 +24,7 @@ from ratslam.mapping.normal_equations import (
     measurement_errors,
     weigh_closures,
 )
-from tactile.base.se2 import bend_motion, correct_heading, wrap
+from tactile.base.se2 import bend_motion, between, correct_heading, wrap
 
 HALVINGS = 10
 """Number of lengths tried of a step."""
@@ -151,6 +151,12 @@ class MapFit(NamedTuple):
         """[N - 1, 3] the chain's motions without their systematic errors."""
         return correct_heading(chain.motion, chain.length, self.bias, self.turn_error)
 
+    def strain(self, chain: OdometryChain) -> np.ndarray:
+        """[N - 1] chi-squares of the chain."""
+        error = between(self.poses[:-1], self.poses[1:]) - self.corrected(chain)
+        error[:, 2] = wrap(error[:, 2])
+        return (error**2 / chain.variance).sum(axis=1)
+
     def corrected_links(self, links: OdometryLinks) -> np.ndarray:
         """[L, 3] the motions of links without their systematic errors."""
         return bend_motion(links.motion, self.bias * links.length + self.turn_error * links.turn)
@@ -224,9 +230,8 @@ class MapCovariance:
             right[at] += by.T
         spread, none = factor.solve(right), np.zeros((3, 3))
         pull = sum((by @ self._bent[at] for at, by in free), none[:, : len(self._calibrated)])
-        return sum((by @ spread[at] for at, by in free), none) + pull @ np.linalg.solve(
-            self._calibrated, pull.T
-        )
+        shared = pull @ np.linalg.solve(self._calibrated, pull.T)
+        return sum((by @ spread[at] for at, by in free), none) + shared
 
 
 class System:
@@ -324,21 +329,14 @@ class System:
         poses = np.ascontiguousarray(fit.poses)
         measured, error, chi2 = self._errors(fit)
         trust, weights, _ = weigh_closures(chi2, *self._closures)
-        n, blocks, parameters = self._pattern.count, len(self._pattern.row), self._parameters
-        diagonal, above, right = (
-            np.zeros(shape) for shape in ((n, 3, 3), (blocks, 3, 3), (n, 3, 1 + parameters))
-        )
+        pattern, parameters = self._pattern, self._parameters
+        shapes = (pattern.count, 3, 3), (len(pattern.row), 3, 3), (pattern.count, 3, 1 + parameters)
+        diagonal, above, right = (np.zeros(shape) for shape in shapes)
         corner, slope = np.zeros((parameters, parameters)), np.zeros(parameters)
         add_measurements(self._edges, poses, measured, error, trust, (diagonal, above, right, corner, slope))
         off, tight = _calibration(fit, self._problem.prior)
-        return Equations(
-            self._pattern.factorise(diagonal, above),
-            self._pattern.place,
-            right,
-            corner + np.diag(tight),
-            slope + tight * off,
-            weights,
-        )
+        factor, corner = pattern.factorise(diagonal, above), corner + np.diag(tight)
+        return Equations(factor, pattern.place, right, corner, slope + tight * off, weights)
 
     def _errors(self, fit: MapFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `measurement_errors`."""

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 
 PI = float(np.pi)
+Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Edges(NamedTuple):
@@ -44,9 +45,7 @@ class Edges(NamedTuple):
 
 
 @compiled
-def difference_error(
-    poses: np.ndarray, i: np.ndarray, j: np.ndarray, motion: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def difference_error(poses: np.ndarray, i: np.ndarray, j: np.ndarray, motion: np.ndarray) -> Triple:
     """The error of g2o: the pose of j in the frame of i, minus the measured one, in the measured frame.
 
     Args:
@@ -112,12 +111,7 @@ class GraphEquations:
         self._tree = nodes[1:].astype(np.int64), parent[nodes[1:]].astype(np.int64)
 
     def step(
-        self,
-        errors: tuple[np.ndarray, np.ndarray, np.ndarray],
-        information: np.ndarray,
-        weights: np.ndarray,
-        curvature: np.ndarray,
-        damping: float,
+        self, errors: Triple, information: np.ndarray, weights: np.ndarray, curvature: np.ndarray, damp: float
     ) -> np.ndarray | None:
         """The damped step of Newton's method [N, 3], or None if the equations are singular.
 
@@ -129,7 +123,7 @@ class GraphEquations:
         above = np.zeros((len(self.pattern.row), 3, 3))
         _add_edges(self._ends, errors, information, weights, curvature, (diagonal, above, right))
         scale = np.diagonal(diagonal, axis1=1, axis2=2)
-        diagonal[:, range(3), range(3)] += damping * np.where(scale > 0, scale, 1.0) + (scale == 0)
+        diagonal[:, range(3), range(3)] += damp * np.where(scale > 0, scale, 1.0) + (scale == 0)
         factor = self.pattern.factorise(diagonal, above)
         if factor is None:
             return None
@@ -162,15 +156,10 @@ def _move_along_tree(
 
 @compiled
 def _add_edges(
-    ends: tuple[np.ndarray, np.ndarray, np.ndarray],
-    errors: tuple[np.ndarray, np.ndarray, np.ndarray],
-    information: np.ndarray,
-    weights: np.ndarray,
-    curvature: np.ndarray,
-    blocks: tuple[np.ndarray, np.ndarray, np.ndarray],
+    ends: Triple, errors: Triple, information: np.ndarray, trust: np.ndarray, bend: np.ndarray, blocks: Triple
 ) -> None:
-    """Adds edges to the equations: of each the weight [E] times J' W J, less the curvature [E] times
-    (J' W e) (J' W e)', and the weight times -J' W e; see `Kernel`.
+    """Adds edges to the equations: of each the weight `trust` [E] times J' W J, less the curvature `bend` [E]
+    times (J' W e) (J' W e)', and the weight times -J' W e; see `Kernel`.
 
     Args:
         ends: [E] position of either node in the order of elimination, -1 for node 0, and the block above
@@ -187,13 +176,13 @@ def _add_edges(
                 pull[r] += information[e, r, c] * error[e, c]
         for r in range(3):
             for c in range(3):
-                tight[r, c] = weights[e] * information[e, r, c] - curvature[e] * pull[r] * pull[c]
+                tight[r, c] = trust[e] * information[e, r, c] - bend[e] * pull[r] * pull[c]
         for at, by in ((at_i[e], by_i[e]), (at_j[e], by_j[e])):
             if at >= 0:
                 _add_product(by, tight, by, diagonal[at])
                 for p in range(3):
                     for r in range(3):
-                        right[at, p, 0] -= weights[e] * by[r, p] * pull[r]
+                        right[at, p, 0] -= trust[e] * by[r, p] * pull[r]
         if slot[e] >= 0 and at_i[e] < at_j[e]:
             _add_product(by_i[e], tight, by_j[e], above[slot[e]])
         elif slot[e] >= 0:
@@ -333,7 +322,7 @@ def least_squares(
 
 def _evaluate(
     poses: np.ndarray, edges: Edges, information: np.ndarray, kernel: Kernel, robust: np.ndarray
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray, float]:
+) -> tuple[Triple, np.ndarray, np.ndarray, float]:
     """Errors with Jacobians, robust weights [E] and curvature [E], and cost at some poses."""
     errors = difference_error(poses, edges.i, edges.j, edges.motion)
     with np.errstate(over="ignore", invalid="ignore"):

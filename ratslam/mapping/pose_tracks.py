@@ -11,16 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.compiled import compiled
-from ratslam.mapping.ground import (
-    DEVIATIONS,
-    LEAVING,
-    MOST_REACH,
-    MOST_REACH_HEADING,
-    REACH,
-    REACH_HEADING,
-    GainOdds,
-    Ground,
-)
+from ratslam.mapping.ground import LEAVING, REACH, REACH_HEADING, GainOdds, Ground, grown_reaches
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.optimizer import MapFit
 from tactile.base.se2 import inverse
@@ -180,8 +171,7 @@ def _follow(
         pose[2] = _turned(pose[2] + motions[k, 2])
         place += variances[k, 0] + heading * (x * x + y * y)
         heading += variances[k, 2]
-        near = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
-        turn = min(reach_heading + DEVIATIONS * np.sqrt(heading), MOST_REACH_HEADING * reach_heading)
+        near, turn = grown_reaches(reach, reach_heading, place, heading)
         fit, dx, dy, da = _look(ground, turns, fits[frames[k]], pose, near, turn)
         if fit > 0:  # Kalman update by the mean of the poses that the views claim
             share, turned = place / (place + spread[0]), heading / (heading + spread[2])

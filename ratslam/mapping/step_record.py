@@ -64,9 +64,8 @@ class StepRecord(Checkpointed):
         Args:
             frame, travel: see the class. moved: [3] in the step.
         """
-        self._frame.append(frame)
-        self._motion.append([*travel.motion, travel.length])
-        self._odometry.append(compose(self.odometry[-1] if len(self.odometry) else np.zeros(3), moved))
+        odometry = compose(self.odometry[-1] if len(self.odometry) else np.zeros(3), moved)
+        self._append_row(frame, [*travel.motion, travel.length], odometry)
 
     def arrive(self, frame: int, travel: Travel) -> None:
         """The steps that lead to a keyframe are known from it, once it is taken after `travel`."""

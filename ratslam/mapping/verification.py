@@ -71,22 +71,16 @@ def judge_by_map(
     error[:, 2] = wrap(error[:, 2])
     distance = np.einsum("na,ab,nb->n", error, np.linalg.inv(allowed), error)
     among = np.log(max(np.exp(-distance / 2).sum(), 1.0))
-    return (
-        float(np.log(len(error)) - distance[i] / 2 - among),
-        float(distance[i]),
-        float(np.sqrt(np.linalg.eigvalsh(own[:2, :2]).max())),
-        float(np.sqrt(own[2, 2])),
-    )
+    ratio = np.log(len(error)) - distance[i] / 2 - among
+    position, heading = np.sqrt(np.linalg.eigvalsh(own[:2, :2]).max()), np.sqrt(own[2, 2])
+    return float(ratio), float(distance[i]), float(position), float(heading)
 
 
 def _motions(graph: KeyframeGraph, first: Candidate, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
     """[3] motion from one candidate to a later one: between the remembered poses, and in the map."""
     pose, angle = graph.pose.rows, graph.sector_angle
-    remembered = between(
-        turn_on_spot(pose[first.match], -first.shift * angle),
-        turn_on_spot(pose[candidate.match], -candidate.shift * angle),
-    )
-    return remembered, between(pose[first.keyframe], pose[candidate.keyframe])
+    start, end = (turn_on_spot(pose[one.match], -one.shift * angle) for one in (first, candidate))
+    return between(start, end), between(pose[first.keyframe], pose[candidate.keyframe])
 
 
 def map_distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> float:

@@ -87,7 +87,7 @@ class LocaliseBackend(Backend):
         frames = map.kept_keyframes().taken.rows
         self._memory = views.freeze(frames, poses[frames])
         every = np.arange(len(poses))
-        odds = views.odds(every, poses, np.isin(every, frames), SESSION_WEIGHTING)
+        odds = views.odds(every, poses, SESSION_WEIGHTING, np.isin(every, frames))
         self._place = Place(map, frames, views.ground(poses[frames]), odds)
         self._start = map.map_trajectory()[-1] if here else None
 

@@ -196,19 +196,16 @@ def contact_signs(made: ContactMap, poses: np.ndarray, levels: np.ndarray, known
         poses: [K, 3] in the map. levels: [K, D] of the images. known: [K] number of the first keyframes of
             the map with which each is compared.
     """
-    ground, found = made.ground, []
+    ground, found = made.ground, [(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0), np.zeros(0))]
     remembered, _ = contact_points(ground.poses, made.levels, made.head, made.tallest)
     points, touched = contact_points(poses, levels, made.head, made.tallest)
     for k, pose in enumerate(poses):
         shift, frame = ground.near(pose, ground.reach, ground.reach_heading)
         near = shift[frame < known[k]], frame[frame < known[k]]
         if len(near[0]):
-            found.append((k, *_compare(made, remembered, levels[k], points[k], touched[k], near)))
-    if not found:
-        empty = np.zeros(0)
-        return Signs(np.zeros((0, 2)), empty, empty, empty.astype(int), len(poses))
-    number = np.concatenate([np.full(len(evidence), k) for k, _, evidence, _ in found])
-    where, evidence, appears = (np.concatenate(column) for column in list(zip(*found, strict=True))[1:])
+            signs = _compare(made, remembered, levels[k], points[k], touched[k], near)
+            found.append((np.full(len(signs[0]), k), *signs))
+    number, where, evidence, appears = (np.concatenate(column) for column in zip(*found, strict=True))
     return Signs(where, evidence, appears, number, len(poses))
 
 

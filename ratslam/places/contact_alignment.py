@@ -45,8 +45,7 @@ class ContactCloud:
         cell = cell.reshape(-1)
         count = np.bincount(cell, minlength=len(cells))
         sums = [np.bincount(cell, points[:, k], minlength=len(cells)) for k in range(2)]
-        thin = np.stack(sums, axis=1)[count >= 2] / count[count >= 2, None]
-        self.points = thin if len(thin) else np.zeros((0, 2))
+        self.points = np.stack(sums, axis=1)[count >= 2] / count[count >= 2, None]
         self._tree = cKDTree(self.points)
         self.normals = np.zeros((len(self.points), 2))  # unit vectors across the points around each
         for k, point in enumerate(self.points):

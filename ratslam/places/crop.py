@@ -75,22 +75,16 @@ def crop_map(map: KeyframeMap, blank: KeyframeMap, inside: np.ndarray) -> Croppe
     _take_graph(graph, taken, sequences, since)
     if map.archive.begun:
         arrays["merger/merge_due/0"] = np.array(map.config.merge_stood > 0)
-    views = map.appearance.stored(taken)
-    map.appearance.take(taken)
+    appearance = map.appearance
+    views = appearance.stored(taken)
+    appearance.take(taken)
     motion, length, turn = (own[f"travel/{k}"] for k in range(3))
-    arrays |= {
-        "travel/0": compose(since.motion, motion),
-        "travel/1": np.array(since.length + length),
-        "travel/2": np.array(since.turn + turn),
-        "solved/0": np.array(-1),
-        "solved/1": np.array(-1),
-    }
-    parts = (
-        ("graph/", graph), ("log/", log), ("steps/", steps), ("experiences/", experiences),
-        ("appearance/", map.appearance),
-    )  # fmt: skip
-    for prefix, part in parts:
-        arrays |= {prefix + name: value for name, value in part.arrays().items()}
+    travel = compose(since.motion, motion), since.length + length, since.turn + turn
+    arrays |= {f"travel/{k}": np.array(value) for k, value in enumerate(travel)}
+    arrays |= {"solved/0": np.array(-1), "solved/1": np.array(-1)}
+    parts = dict(graph=graph, log=log, steps=steps, experiences=experiences, appearance=appearance)
+    for name, part in parts.items():
+        arrays |= {f"{name}/{key}": value for key, value in part.arrays().items()}
     # The hypotheses of the selection begin at the first keyframe, so that the map stays where it was.
     arrays["selection/hypotheses/poses/0"] = graph.pose.rows[None, :1].copy()
     compared = own.get("acceptance/log_ratio")  # with odometry, where the rule of acceptance does that

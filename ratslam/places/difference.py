@@ -111,7 +111,6 @@ def overlap(one: Remembered, other: Remembered) -> tuple[int, Span, Span] | None
     common = np.array([pair for pair in pairs if pair[1] - pair[0] in shifts], int).reshape(-1, 2)
     if not len(common):
         return None
-    one_span, other_span = (
-        (int(span.min()), int(span.max())) for span in (steps[common[:, 0]], other_steps[common[:, 1]])
-    )
+    held = steps[common[:, 0]], other_steps[common[:, 1]]
+    one_span, other_span = ((int(at.min()), int(at.max())) for at in held)
     return len(common), one_span, other_span

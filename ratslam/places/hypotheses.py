@@ -32,6 +32,10 @@ BESIDE_SHARE = 0.3
 """Share of the evidence against a path that counts beside the way after the first such keyframe of a run."""
 
 
+Onwards = Iterable[tuple[Motion, np.ndarray | None]]
+"""The motion into each further keyframe, and the gains [S, N] of its view, None if it shows nothing."""
+
+
 class Path(NamedTuple):
     """A pose hypothesis followed through n keyframes: poses [n, 3], m, m, rad, and log-odds [n] of each
     keyframe, nat; `first`: the number of the first one in its session."""
@@ -75,22 +79,15 @@ class Path(NamedTuple):
         return np.where(again & (odds > 0), AGAIN_SHARE * odds, odds)
 
 
-def follow(
-    ground: Ground,
-    odds: GainOdds,
-    at: PoseHypothesis,
-    onwards: Iterable[tuple[Motion, np.ndarray | None]],
-    least: float = -np.inf,
-) -> Path:
+def follow(ground: Ground, odds: GainOdds, at: PoseHypothesis, way: Onwards, least: float = -np.inf) -> Path:
     """The path from a pose hypothesis on mapped ground; ends early once its log-odds are below `least`.
 
     Args:
-        onwards: the motion into each further keyframe, and the gains [S, N] of its view, None if it shows
-            nothing.
+        way: from there on, see `Onwards`.
     """
     poses, gained = [at.pose], [0.0]
     total, inside = 0.0, True
-    for moved, gains in onwards:
+    for moved, gains in way:
         at, gain = advance(ground, at, moved, gains)
         log_odds, inside = keyframe_odds(ground, odds, at.pose, gain, inside)
         poses.append(at.pose)
@@ -157,15 +154,11 @@ class SessionViews(Checkpointed):
         if self.count >= 2 * SPAN:
             self.forget(SPAN)
         empty = np.zeros(self.gain.rows.shape[1:], np.float32)
-        self.gain.append(empty if gain is None else gain)
-        self.shows.append(gain is not None)
-        self.motion.append(moved.motion)
-        self.variance.append(moved.variance)
+        self._append_row(empty if gain is None else gain, gain is not None, *moved)
 
     def forget(self, keep: int) -> None:
         """Forgets all but the newest keyframes."""
-        for array in self._growable_arrays().values():
-            array.replace(array.rows[max(len(array.rows) - keep, 0) :].copy())
+        self._take_rows(slice(max(self.count - keep, 0), None))
 
     def moved(self, k: int) -> Motion:
         """The odometry into keyframe k."""
@@ -208,18 +201,13 @@ class Hypotheses(Checkpointed):
         return PoseHypothesis(self.pose.rows[k], self.covariance.rows[k])
 
     def advance(
-        self,
-        ground: Ground,
-        odds: GainOdds,
-        moved: Motion,
-        gain: np.ndarray | None,
-        recalled: Recalled | None = None,
+        self, ground: Ground, odds: GainOdds, step: Motion, gain: np.ndarray | None, recalled: Recalled | None
     ) -> None:
         """Moves all hypotheses to the newest keyframe; drops unlikely ones, and the weaker of two that
         have become one."""
         log_odds = np.zeros(self.count)
         for k in range(self.count):
-            at, gained = advance(ground, self.at(k), moved, gain)
+            at, gained = advance(ground, self.at(k), step, gain)
             log_odds[k], inside = keyframe_odds(ground, odds, at.pose, gained, bool(self.inside.rows[k]))
             self.pose.rows[k], self.covariance.rows[k] = at
             self.inside.rows[k] = inside
@@ -237,7 +225,7 @@ class Hypotheses(Checkpointed):
             if likely and not same_pose(ground, self.pose.rows[kept], self.pose.rows[k]).any():
                 kept.append(k)
         if len(kept) < self.count:
-            self._keep(np.isin(np.arange(self.count), kept))
+            self._take_rows(np.isin(np.arange(self.count), kept))
 
     def propose(self, ground: Ground, odds: GainOdds, views: SessionViews, pose: np.ndarray) -> None:
         """Adds a pose hypothesis [3] of the newest keyframe, with the log-odds of its own way back to the
@@ -268,16 +256,11 @@ class Hypotheses(Checkpointed):
         are too low."""
         if log_odds < MIN_LOG_ODDS:
             return
-        self.pose.append(at.pose)
-        self.covariance.append(at.covariance)
-        self.log_odds.append(log_odds)
-        self.states.append(NOTHING_CHANGED)
-        self.best.append(0.0)
-        self.inside.append(True)
+        self._append_row(*at, log_odds, NOTHING_CHANGED, 0.0, True)
 
     def clear(self) -> None:
         """Drops all."""
-        self._keep(np.zeros(self.count, bool))
+        self._take_rows(slice(0))
 
     def fall(self, k: int) -> float:
         """By how much the log-odds of a pose hypothesis are below their best, changed ground allowed for."""
@@ -286,10 +269,6 @@ class Hypotheses(Checkpointed):
     def ranked(self) -> np.ndarray:
         """[h] the hypotheses by descending log-odds."""
         return np.argsort(-self.log_odds.rows, kind="stable")
-
-    def _keep(self, rows: np.ndarray) -> None:
-        for array in self._growable_arrays().values():
-            array.replace(array.rows[rows].copy())
 
 
 def same_pose(ground: Ground, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:

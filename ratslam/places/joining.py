@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.mapping.closure_selection import MapHypotheses
-from ratslam.mapping.ground import Ground, Motion
+from ratslam.mapping.ground import MAP_WEIGHTING, Ground, Motion
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, Verdict
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.map_solution import MapSolution, selected_solution, solved_map
+from ratslam.mapping.map_solution import MapSolution, selected_solution
 from ratslam.mapping.optimizer import MapCovariance
 from ratslam.places.hypotheses import Path
 from ratslam.places.map_views import MapViews
@@ -43,6 +43,8 @@ STANDING = 0.5
 
 Stretches = tuple[int, ...]
 """Numbers of the stretches of keyframes, each from one beginning of a piece to the next, that a piece has."""
+Tried = set[tuple[Stretches, Stretches]]
+"""Pairs of pieces that were compared."""
 
 
 class Join(NamedTuple):
@@ -88,10 +90,7 @@ class _Found(NamedTuple):
 
 
 def join_all(
-    map: KeyframeMap,
-    views: MapViews,
-    tried: set[tuple[Stretches, Stretches]],
-    report: Callable[[str], None] = lambda _: None,
+    map: KeyframeMap, views: MapViews, tried: Tried, report: Callable[[str], None] = lambda _: None
 ) -> list[Join]:
     """Joins pieces of a map, two at a time, until nothing joins any more, and merges keyframes on common
     ground.
@@ -111,9 +110,7 @@ def join_all(
     return joins
 
 
-def _join_some(
-    map: KeyframeMap, views: MapViews, tried: set[tuple[Stretches, Stretches]], report: Callable[[str], None]
-) -> Join | None:
+def _join_some(map: KeyframeMap, views: MapViews, tried: Tried, report: Callable[[str], None]) -> Join | None:
     """Joins the first two pieces that can be joined, of those that were not tried yet."""
     graph = map.kept_keyframes()
     piece, stretch = graph.pieces(map.log), np.cumsum(graph.begins.rows)
@@ -157,7 +154,7 @@ def _join(map: KeyframeMap, views: MapViews, one: np.ndarray, other: np.ndarray)
         hypotheses = MapHypotheses()
         hypotheses.begin(trial.fit(), log.sequences)
         selected = selected_solution(trial, log, hypotheses)
-    solution = selected or solved_map(trial, log)
+    solution = selected or MapSolution.solved(trial, log)
     new = np.arange(log.sequences) >= first
     standing = new & (solution.log.verdicts() == Verdict.ACCEPTED)
     scores = solution.log.scores()
@@ -170,11 +167,9 @@ def _join(map: KeyframeMap, views: MapViews, one: np.ndarray, other: np.ndarray)
     joined = np.where((piece[1:] != piece[:-1])[:, None], 1.0, problem.chain.variance)
     problem = problem._replace(chain=problem.chain._replace(variance=joined))
     covariance = MapCovariance(graph.fit(), problem).relative(middle.match, middle.keyframe, 0.0)
-    return Join(
-        ((), ()), start, np.sqrt(np.diag(covariance)),
-        (found.log_odds, back.log_odds), (found.needed, back.needed),
-        sum(len(sequence) for sequence in sequences),
-    )  # fmt: skip
+    log_odds, needed = (found.log_odds, back.log_odds), (found.needed, back.needed)
+    count = sum(len(sequence) for sequence in sequences)
+    return Join(((), ()), start, np.sqrt(np.diag(covariance)), log_odds, needed, count)
 
 
 def _place(map: KeyframeMap, views: MapViews, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
@@ -184,7 +179,7 @@ def _place(map: KeyframeMap, views: MapViews, onto: np.ndarray, frames: np.ndarr
     own = graph.pose.rows[frames]
     every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else graph.taken.rows[onto]
     poses = archive.poses(graph.pose.rows)[every]
-    ground, odds = views.ground(poses), views.odds(every, poses)
+    ground, odds = views.ground(poses), views.odds(every, poses, MAP_WEIGHTING)
     motions = _motions(graph, own)
     session = Traverse(_compare(graph, views, every, poses, frames), motions, MIN_LOG_ODDS, own)
     paths = []

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ratslam.core.arrays import Checkpointed, GrowableArray
-from ratslam.core.backend import Evidence, Map
-from ratslam.core.estimates import Estimate, Localisation, LocalisedPose, pieces_of, write_course
+from ratslam.core.arrays import GrowableArray
+from ratslam.core.backend import Evidence, LocalisedMap
+from ratslam.core.estimates import Estimate, Localisation, LocalisedPose
 from ratslam.mapping.ground import (
-    MAP_WEIGHTING,
     NO_MOTION,
     SESSION_WEIGHTING,
     GainOdds,
@@ -83,7 +82,7 @@ class Visits(NamedTuple):
     view: np.ndarray
 
 
-class Localiser(Checkpointed, Map):
+class Localiser(LocalisedMap):
     """The map of the localise backend: the poses of a session in a finished map.
 
     Args:
@@ -92,12 +91,11 @@ class Localiser(Checkpointed, Map):
             until views contradict it. None: unknown.
     """
 
-    VALUES = (
-        "_travel", "_state", "_recalled", "_newest", "_covariance", "_mass", "_log_odds",
-    )  # fmt: skip
+    VALUES = ("_travel", "_state", "_recalled", "_newest", "_covariance", "_mass", "_log_odds")
     PARTS = ("_views", "_hypotheses")
 
     def __init__(self, place: Place, log_odds: float, start: np.ndarray | None = None) -> None:
+        super().__init__("ground", place.ground.poses)
         self.place = place
         self._places = float(np.log(max(place.ground.places(), 1.0)))
         self._needed = log_odds + self._places
@@ -108,9 +106,8 @@ class Localiser(Checkpointed, Map):
         self._recalled = NOTHING_RECALLED
         self._newest, self._covariance = np.zeros(3), np.zeros((3, 3))  # pose of the newest keyframe
         self._mass, self._log_odds = 0.0, -self._places
-        self._pose = GrowableArray((3,), np.float64)
-        self._states = GrowableArray((), np.int64)
-        self._record = GrowableArray((3,), np.float64)  # mass, log-odds, largest standard deviation
+        course = self._course  # of which a checkpoint has these arrays
+        self._pose, self._states, self._record = course.pose, course.states, course.record
         self._frame = GrowableArray((), np.int64)  # step of each keyframe
         self._found = GrowableArray((3,), np.float64)  # its pose, NaN where that is not known
         size = place.map.appearance.stored(place.frames[:0])[0].shape[1]
@@ -125,24 +122,11 @@ class Localiser(Checkpointed, Map):
     # Queries
 
     def localisation(self) -> LocalisedPose:
-        """The robot's pose now, and whether it is known."""
         now = PoseHypothesis(self._newest, self._covariance).moved(self._moved())
         state = Localisation(self._state)
         if state == Localisation.FOUND and not now.is_comparable(self.place.ground):
             state = Localisation.LOST  # nothing was seen for long
         return LocalisedPose(state, *now, self._mass, self._log_odds)
-
-    def pose(self, estimate: Estimate) -> np.ndarray:
-        del estimate
-        return self.localisation().pose
-
-    def trajectory(self) -> np.ndarray:
-        """[T, 3] poses of all steps: in the map where they were found, by odometry from there elsewhere."""
-        return self._pose.rows.copy()
-
-    def states(self) -> np.ndarray:
-        """[T] the `Localisation` at each step."""
-        return self._states.rows.copy()
 
     def visits(self) -> Visits:
         """Where the session was in the map, and what it saw there."""
@@ -150,21 +134,13 @@ class Localiser(Checkpointed, Map):
         found = np.isfinite(pose[:, 0])
         return Visits(self._frame.rows[found], pose[found], self._view.rows[found])
 
-    def pieces(self) -> np.ndarray:
-        """[T] the piece of each step: all steps where the pose was found are one, and so is each stretch
-        between."""
-        return pieces_of(self._states.rows)
-
     def graph(self) -> networkx.DiGraph:
         """The graph of the finished map."""
         return self.place.map.graph()
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """State, mass and log-odds of every step as CSV, and the graph of the finished map."""
-        return {
-            "localisation.csv": lambda path: write_course(path, self._states.rows, self._record.rows),
-            "map.json": self.place.map.files()["map.json"],
-        }
+        return super().files() | {"map.json": self.place.map.files()["map.json"]}
 
     # Changes
 
@@ -175,31 +151,13 @@ class Localiser(Checkpointed, Map):
             self._view.append(self.place.map.appearance.view_of(observation))
             self._add_keyframe(evidence)
         now = self.localisation()
-        self._pose.append(now.pose)
-        self._states.append(int(now.state))
-        self._record.append(
-            (now.mass, now.log_odds, PoseHypothesis(now.pose, now.covariance).deviations()[0])
-        )
+        self._course.append(now, PoseHypothesis(now.pose, now.covariance).deviations()[0])
         return now.complete(estimate)
 
     @property
     def compared(self) -> int:
         """Number of views compared with the map."""
         return len(self._frame.rows)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The whole state, with the poses of the finished map."""
-        return super().arrays() | {"ground": self.place.ground.poses.copy()}
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`.
-
-        Raises:
-            ValueError: the finished map has changed since.
-        """
-        if not np.array_equal(arrays["ground"], self.place.ground.poses):
-            raise ValueError("a session in another map, or in this one before it was changed")
-        super().restore(arrays)
 
     def _add_keyframe(self, evidence: Evidence) -> None:
         ground, odds = self.place.ground, self.place.odds
@@ -292,32 +250,26 @@ Gains = Callable[[int, int], np.ndarray]
 Arguments: the keyframe, n."""
 
 
-def _follow(
-    ground: Ground, gains: np.ndarray, motions: list[Motion], poses: np.ndarray, count: int
-) -> np.ndarray:
-    """[P, count] gains of the first keyframes of a stretch that begins at each of `poses` [P, 3].
+def _follow(ground: Ground, gains: np.ndarray, moves: list[Motion], poses: np.ndarray, k: int) -> np.ndarray:
+    """[P, k] gains of the first keyframes of a stretch that begins at each of `poses` [P, 3].
 
     Args:
-        gains: [n, S, M] of its views on the ground. motions: [n] into each keyframe.
+        gains: [n, S, M] of its views on the ground. moves: [n] into each keyframe.
     """
-    at, found = PoseHypothesis(poses, np.zeros((len(poses), 3, 3))), np.zeros((len(poses), count))
-    for k in range(count):
-        at, found[:, k] = advance_all(ground, at, motions[k], gains[k])
+    at, found = PoseHypothesis(poses, np.zeros((len(poses), 3, 3))), np.zeros((len(poses), k))
+    for row in range(k):
+        at, found[:, row] = advance_all(ground, at, moves[row], gains[row])
     return found
 
 
 def compare_with_itself(
-    ground: Ground,
-    guard: int,
-    gains: Gains,
-    held: np.ndarray | None = None,
-    weighing: GainWeighting = MAP_WEIGHTING,
+    ground: Ground, guard: int, gains: Gains, weighing: GainWeighting, held: np.ndarray | None = None
 ) -> GainOdds:
     """The log-odds of gains on this ground.
 
     Args:
-        guard: number of keyframes before a stretch that do not count as ground. held: [N] bool, the keyframes
-            that are ground for a session; None: all. weighing: of the gains.
+        guard: number of keyframes before a stretch that do not count as ground. weighing: of the gains.
+            held: [N] bool, the keyframes that are ground for a session; None: all.
     """
     count = len(ground.poses)
     held = np.ones(count, bool) if held is None else held

@@ -17,16 +17,7 @@ from jax import lax
 
 from ratslam.core.session import capacity_at
 from ratslam.mapping.archive import Archive
-from ratslam.mapping.ground import (
-    MAP_WEIGHTING,
-    PIECE_WEIGHTING,
-    GainOdds,
-    GainWeighting,
-    Ground,
-    LearnedOdds,
-    Motion,
-    ground_of,
-)
+from ratslam.mapping.ground import PIECE_WEIGHTING, GainOdds, GainWeighting, Ground, LearnedOdds, Motion
 from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog
 from ratslam.mapping.map import Tie
@@ -35,7 +26,7 @@ from ratslam.places.localiser import compare_with_itself
 from ratslam.places.placement import Comparison, Traverse, closures_along, find_placements
 from ratslam.recall import filter
 from ratslam.recall.config import RecallConfig, sector_shifts
-from ratslam.recall.memory import MapFeedback, Memory, frozen_memory
+from ratslam.recall.memory import MapFeedback, Memory, init_memory
 from ratslam.recall.observation_model import ObservationLikelihood
 from tactile.base.types import Array
 
@@ -94,29 +85,24 @@ class MapViews:
         feedback = MapFeedback(poses, graph.bias, graph.turn_error, 0.0, *graph.appearance.metric())
         views, labels = graph.appearance.stored(frames)
         capacity = capacity or capacity_at(len(labels))
-        return frozen_memory(self.config, feedback, views, labels, capacity, recall.dtype, recall.groups)
+        empty = init_memory(self.config, views.shape[1], capacity, recall.dtype, recall.groups)
+        return empty.filled(feedback, views, labels)
 
     def ground(self, poses: np.ndarray) -> Ground:
         """Keyframes at `poses` [N, 3] as ground."""
-        graph = self.graph
-        return ground_of(
-            poses, self.config, self.recall.cell, graph.sector_angle, graph.closure_variance(),
-            graph.appearance.NEAR_SHARE,
-        )  # fmt: skip
+        angle, variance = self.graph.sector_angle, self.graph.closure_variance()
+        share = self.graph.appearance.NEAR_SHARE
+        return Ground.of(poses, self.shifts, self.recall.cell, angle, variance, share)
 
     def odds(
-        self,
-        frames: np.ndarray,
-        poses: np.ndarray,
-        held: np.ndarray | None = None,
-        weighing: GainWeighting = MAP_WEIGHTING,
+        self, frames: np.ndarray, poses: np.ndarray, weighing: GainWeighting, held: np.ndarray | None = None
     ) -> GainOdds:
         """The log-odds of gains, by comparing keyframes `frames` [N], of all ever taken and in order of time,
         with each other.
 
         Args:
-            held: [N] bool, those that a session is compared with, the others being merged with them; None:
-                all. weighing: of the gains.
+            weighing: of the gains. held: [N] bool, those that a session is compared with, the others being
+                merged with them; None: all.
         """
         held = np.ones(len(frames), bool) if held is None else held
         whole, guard = self.freeze(frames[held], poses[held]), self.recall.recall.guard
@@ -129,7 +115,7 @@ class MapViews:
             return np.asarray(self._gains(earlier, view, label))
 
         weighing = weighing._replace(prior=self.graph.appearance.gain_prior(weighing.prior))
-        return compare_with_itself(self.ground(poses), guard, gains, held, weighing)
+        return compare_with_itself(self.ground(poses), guard, gains, weighing, held)
 
     def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
         """Compares the views of keyframes `frames` [n], of all ever taken and in order of time.
@@ -171,10 +157,8 @@ class MapViews:
     def look(self, memory: Memory, belief: Belief, view: Array, label: Array) -> tuple[Memory, Belief, Look]:
         """Recalls one view in its stored form, and compares it with all keyframes."""
         memory, likelihood = self.recall.likelihood(self.config, memory, view, label)
-        motion = memory.corrected_motion()
-        belief, result = filter.recognise(
-            self.config, self.recall.network, memory, belief, motion, likelihood, 0.0
-        )
+        motion, network = memory.corrected_motion(), self.recall.network
+        belief, result = filter.recognise(self.config, network, memory, belief, motion, likelihood, 0.0)
         zero = jnp.zeros_like(memory.length)
         memory = memory._replace(motion=jnp.zeros_like(memory.motion), length=zero, turn=zero)
         shows = likelihood.certain & likelihood.informative
@@ -198,9 +182,8 @@ class MapViews:
 
         def look(state: tuple[Memory, Belief], one: tuple[Array, ...]) -> tuple[tuple[Memory, Belief], Look]:
             (memory, belief), (view, label, motion, real) = state, one
-            moved = memory._replace(
-                motion=motion, length=jnp.hypot(motion[0], motion[1]), turn=jnp.abs(motion[2])
-            )
+            length = jnp.hypot(motion[0], motion[1])
+            moved = memory._replace(motion=motion, length=length, turn=jnp.abs(motion[2]))
             memory, belief, found = lax.cond(
                 real,
                 lambda: self.look(moved, belief, view, label),
@@ -269,9 +252,8 @@ def _place_on(
 
     def learn() -> GainOdds:
         every = np.flatnonzero(np.isin(archive.row.rows, frames)) if archive.begun else taken
-        return views.odds(
-            every, archive.poses(graph.pose.rows)[every], np.isin(every, taken), PIECE_WEIGHTING
-        )
+        held = np.isin(every, taken)
+        return views.odds(every, archive.poses(graph.pose.rows)[every], PIECE_WEIGHTING, held)
 
     ground, memory = views.ground(poses), views.freeze(taken, poses)
     learned = odds.of((len(frames), int(taken[0]), int(taken[-1])), learn)

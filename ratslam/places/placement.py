@@ -58,13 +58,11 @@ class _RecalledPose(NamedTuple):
         """Whether the pose is to be proposed for the newest keyframe."""
         return self.now and self.agreeing >= CONFIRMING
 
-    def onwards(
-        self, ground: Ground, moved: Motion, shift: int, match: int, posterior: float
-    ) -> _RecalledPose:
+    def onwards(self, ground: Ground, moved: Motion, shift: int, match: int, mass: float) -> _RecalledPose:
         """After the next keyframe, reached by `moved`, which recall places at keyframe `match` of the ground
-        (-1: nowhere), turned by the sector shift of row `shift`, with this posterior."""
+        (-1: nowhere), turned by the sector shift of row `shift`, with this posterior `mass`."""
         expected = compose(self.pose, moved.motion)
-        if match < 0 or posterior <= 0.5:
+        if match < 0 or mass <= 0.5:
             return _RecalledPose(expected, self.agreeing, False)
         pose = ground.claims(np.array([shift]), np.array([match]))[0]
         error = between(expected, pose)
@@ -105,9 +103,8 @@ class Traverse(NamedTuple):
         before = follow(ground, odds, at, back, self.least)
         onwards = ((motions[i], views.gains(i)) for i in range(k + 1, len(motions)))
         after = follow(ground, odds, at, onwards, self.least)
-        poses, gained = (
-            np.concatenate([one[:0:-1], other]) for one, other in zip(before[:2], after[:2], strict=True)
-        )
+        parts = zip(before[:2], after[:2], strict=True)
+        poses, gained = (np.concatenate([one[:0:-1], other]) for one, other in parts)
         path = Path(poses, gained, k + 1 - len(before.poses))
         if self.solved is not None:
             confirmed = np.flatnonzero(path.odds > 0)

@@ -147,14 +147,9 @@ def find_way(graph: networkx.Graph, start: int, goals: Sequence[int], mode: Mode
 def experiences_near(graph: networkx.Graph, place: int, radius: float) -> list[int]:
     """An experience, and the others of its piece within a distance (m), at any heading."""
     here, piece = np.array(position(graph, place)), graph.nodes[place]["piece"]
-    others = [
-        other
-        for other in graph
-        if other != place
-        and graph.nodes[other]["piece"] == piece
-        and np.hypot(*(np.array(position(graph, other)) - here)) <= radius
-    ]
-    return [place, *others]
+    others = [other for other in graph if other != place and graph.nodes[other]["piece"] == piece]
+    near = (other for other in others if np.hypot(*(np.array(position(graph, other)) - here)) <= radius)
+    return [place, *near]
 
 
 def nearest_experience(

@@ -20,15 +20,7 @@ from ratslam.mapping.step_record import leading_to, settled
 from tactile.base.se2 import bend_motion, between
 
 Arrays = dict[str, np.ndarray]
-AFRESH = (
-    "acceptance/control/",
-    "acceptance/log_ratio",
-    "experiences/",
-    "merger/",
-    "selection/",
-    "solved/",
-    "tie_odds/",
-)
+AFRESH = ("acceptance/log_ratio", "experiences/", "merger/", "selection/", "solved/", "tie_odds/")
 """Parts of a map that begin anew: what they hold is about one session."""
 OF_NEWEST = ("live/", "since/", "turned/", "begins/", "doubt/")
 """Parts about the newest keyframe, which is that of the second map."""
@@ -139,9 +131,7 @@ def _graph(prefix: str, a: Arrays, b: Arrays, counts: tuple[int, int, int], bend
     names = ("pose", "motion", "length", "turn", "cut", "begins", "seam", "taken")
     graph = {prefix + name: np.concatenate([a[prefix + name], moved[prefix + name]]) for name in names}
     i, j, motion, length, turn, variance = (b[f"{prefix}links/{k}"] for k in range(6))
-    links = (
-        i + size, j + size, bend.links(motion, length, turn), length, bend.turns(length, turn), variance
-    )  # fmt: skip
+    links = (i + size, j + size, bend.links(motion, length, turn), length, bend.turns(length, turn), variance)
     for k, value in enumerate(links):
         graph[f"{prefix}links/{k}"] = np.concatenate([a[f"{prefix}links/{k}"], value])
     return graph

@@ -93,9 +93,8 @@ def recognise(
     arrived, dtype = fresh + lost - jnp.sum(entered), memory.x.dtype
     # v_ks = l_ks [(1 - leak) (K'Y)_ks + e_ks] and n = l_new (novelty that stays + mass that found no view
     # cell), both divided by their sum; then A = K v.
-    mass, novel = pose_cells.inhibit(
-        likelihood * (moved + entered).astype(dtype), novelty * arrived.astype(dtype)
-    )
+    weighed = likelihood * (moved + entered).astype(dtype)
+    mass, novel = pose_cells.inhibit(weighed, novelty * arrived.astype(dtype))
     belief = pose_cells.anchor(network, belief, cells, mass)
 
     # The heaviest packet, and the heaviest apart from it.

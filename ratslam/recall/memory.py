@@ -138,10 +138,8 @@ class Memory(NamedTuple):
     def pose_spread(self, config: RecallConfig, cell: float) -> tuple[Array, Array]:
         """Standard deviation of the current pose: position, m, and heading, rad."""
         since = self.since + self.length
-        return (
-            config.local_sd * cell + config.local_rate * since,
-            config.local_heading + config.local_heading_rate / cell * since,
-        )
+        position = config.local_sd * cell + config.local_rate * since
+        return position, config.local_heading + config.local_heading_rate / cell * since
 
     def store_keyframe(self, view: Array, label: Array) -> Memory:
         """Stores the newest view as a keyframe at the robot's current pose.
@@ -204,6 +202,21 @@ class Memory(NamedTuple):
         rows, values, likeness = self.pack_feedback(feedback)
         return self.take_feedback((jnp.asarray(rows), jnp.asarray(values), jnp.asarray(likeness)))
 
+    def filled(self, feedback: MapFeedback, views: np.ndarray, labels: np.ndarray) -> Memory:
+        """The memory with N keyframes in the place of none.
+
+        Args:
+            feedback: poses [N, 3] and view metric of the map. views: [N, D], labels: [N] as recall stores
+                them.
+        """
+        filled = self._replace(
+            view=_put(views.T, self.view),
+            label=_put(labels, self.label, -1),
+            count=jnp.int32(len(labels)),
+            distinct=_distinct(labels),
+        )
+        return filled.apply_map_feedback(feedback)
+
     def first_keyframes(self, count: int) -> Memory:
         """The memory as if it held only its first `count` keyframes, and had seen no view before."""
         label = np.array(self.label)
@@ -239,14 +252,13 @@ class Memory(NamedTuple):
             former = np.asarray(rows)
             return _put(former[..., merged.source], rows) if former.size else jnp.array(former)
 
+        taken = ("x", "y", "heading", "cosine", "sine", "before")
         return self._replace(
             view=_put(merged.view.T, self.view),
             label=_put(merged.label, self.label, -1),
-            x=take(self.x), y=take(self.y), heading=take(self.heading),
-            cosine=take(self.cosine), sine=take(self.sine),
-            before=take(self.before),
             count=jnp.array(count, jnp.int32),
-        )  # fmt: skip
+            **{name: take(getattr(self, name)) for name in taken},
+        )
 
     def crop_rows(self, cropped: CroppedRows) -> Memory:
         """The memory reduced to rows."""
@@ -264,11 +276,9 @@ class Memory(NamedTuple):
         Args:
             odometry: [3] of one step, m, m, rad.
         """
-        return self._replace(
-            motion=compose(self.motion, odometry),
-            length=self.length + jnp.hypot(odometry[0], odometry[1]),
-            turn=self.turn + jnp.abs(odometry[2]),
-        )
+        length = self.length + jnp.hypot(odometry[0], odometry[1])
+        turn = self.turn + jnp.abs(odometry[2])
+        return self._replace(motion=compose(self.motion, odometry), length=length, turn=turn)
 
     def is_motion_due(self, config: RecallConfig, cell: float) -> Array:
         """bool: the robot has moved so far since the newest keyframe that a view is compared again.
@@ -321,28 +331,3 @@ def init_memory(config: RecallConfig, size: int, capacity: int, dtype: np.dtype,
         likeness=zeros(*learned),
         before=zeros(len(sector_shifts(config)), capacity if touch else 0),
     )
-
-
-def frozen_memory(
-    config: RecallConfig,
-    feedback: MapFeedback,
-    views: np.ndarray,
-    labels: np.ndarray,
-    capacity: int,
-    dtype: np.dtype,
-    groups: int,
-) -> Memory:
-    """A memory of N keyframes.
-
-    Args:
-        feedback: poses [N, 3] and view metric of the map. views: [N, D], labels: [N] as recall stores them.
-        capacity: rows, at least N. groups: see `init_memory`.
-    """
-    empty = init_memory(config, views.shape[1], capacity, dtype, groups)
-    filled = empty._replace(
-        view=_put(views.T, empty.view),
-        label=_put(labels, empty.label, -1),
-        count=jnp.int32(len(labels)),
-        distinct=_distinct(labels),
-    )
-    return filled.apply_map_feedback(feedback)

@@ -40,6 +40,10 @@ class ObservationLikelihood(NamedTuple):
     informative: Array
 
 
+Weighed = tuple[Memory, ObservationLikelihood]
+"""The memory with an image's likelihoods, which the next image needs; the likelihood."""
+
+
 def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Array) -> ObservationLikelihood:
     """Likelihood of a view [D]. Novelty contains the mean over all keyframes, so that a view similar to many
     places is little evidence for any of them."""
@@ -65,15 +69,13 @@ def view_likelihood(config: RecallConfig, cell: float, memory: Memory, view: Arr
     )
 
 
-def touch_likelihood(
-    config: RecallConfig, memory: Memory, level: Array, pixels: PixelLayout
-) -> tuple[Memory, ObservationLikelihood]:
+def touch_likelihood(config: RecallConfig, memory: Memory, level: Array, pixels: PixelLayout) -> Weighed:
     """Likelihood of a whisker image: levels [D].
 
     Pixels are not independent, so their log-odds are tempered.
 
     Returns:
-        the memory with this image's likelihoods, which the next image needs; the likelihood.
+        see `Weighed`.
     """
     row = memory.likeness[pixels.group, level]
     then = [memory.view, memory.view[pixels.opposite]][: len(sector_shifts(config))]
@@ -81,16 +83,14 @@ def touch_likelihood(
     return _weigh(config, memory, config.temper * odds)
 
 
-def signed_likelihood(
-    config: RecallConfig, memory: Memory, image: Array
-) -> tuple[Memory, ObservationLikelihood]:
-    """Likelihood of a signed image: its stored form [D]; returns as `touch_likelihood`."""
+def signed_likelihood(config: RecallConfig, memory: Memory, image: Array) -> Weighed:
+    """Likelihood of a signed image: its stored form [D]."""
     model = unpack(memory.likeness)
     odds = log_odds(model, project(model, image[:, None]), project(model, memory.view))
     return _weigh(config, memory, odds[None])
 
 
-def _weigh(config: RecallConfig, memory: Memory, odds: Array) -> tuple[Memory, ObservationLikelihood]:
+def _weigh(config: RecallConfig, memory: Memory, odds: Array) -> Weighed:
     """Likelihood of an image with these log-odds [S, C] against the keyframes.
 
     The likelihood at a new place is that at the successors of keyframes similar to the previous image,
@@ -155,10 +155,8 @@ def label_gains(distinct: int) -> tuple[float, float]:
     Args:
         distinct: number of known ids.
     """
-    same, other = (
-        LABELS["same"] * max(distinct, 1) / LABELS["new_known"],
-        LABELS["other"] / LABELS["new_known"],
-    )
+    same, other = LABELS["same"] * max(distinct, 1), LABELS["other"]
+    same, other = same / LABELS["new_known"], other / LABELS["new_known"]
     return LABEL_TEMPER * float(np.log(same)), LABEL_TEMPER * float(np.log(other))
 
 
@@ -184,8 +182,7 @@ def _background(error: Array, away: Array) -> Array:
     rank = jnp.cumsum(away.astype(jnp.int32))
     count = rank[-1]
     ranks = (jnp.arange(SAMPLES, dtype=jnp.int32) * jnp.maximum(count - 1, 0)) // (SAMPLES - 1) + 1
-    row = jnp.searchsorted(rank, ranks)
-    row = jnp.minimum(row, len(rank) - 1)
+    row = jnp.minimum(jnp.searchsorted(rank, ranks), len(rank) - 1)
     # With fewer than SAMPLES keyframes each is reported once.
     fresh = jnp.concatenate([jnp.ones(1, bool), row[1:] != row[:-1]])
     return jnp.where(fresh & (count > 0), error[row], jnp.nan)

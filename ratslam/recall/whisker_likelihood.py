@@ -117,12 +117,9 @@ def estimate_variation(now: np.ndarray, then: np.ndarray) -> Variation:
         loose = outliers / (outliers + fits) if len(apart) else apart
         outliers = float((loose.sum() + weight * PRIOR.outliers) / (len(apart) + weight))
         width = float(((1 - loose) @ apart + weight * PRIOR.width) / ((1 - loose).sum() + weight))
-    return Variation(
-        share(silent & (now > 0), silent, PRIOR.appears),
-        share(touching & (now == 0), touching, PRIOR.vanishes),
-        width,
-        outliers,
-    )
+    appears = share(silent & (now > 0), silent, PRIOR.appears)
+    vanishes = share(touching & (now == 0), touching, PRIOR.vanishes)
+    return Variation(appears, vanishes, width, outliers)
 
 
 def log_odds_table(common: Background, visits: Variation) -> np.ndarray:

@@ -8,12 +8,7 @@ import yaml
 from pydantic import ValidationError
 
 from ratslam.mapping.config import KeyframeMapConfig
-from ratslam.mapping.odometry_calibration import (
-    HeadingNoise,
-    starting_calibration,
-    starting_noise,
-    write_calibration,
-)
+from ratslam.mapping.odometry_calibration import HeadingNoise, starting_calibration, write_calibration
 from ratslam.mapping.optimizer import CalibrationPrior, MapCovariance
 from tactile.base.se2 import wrap
 from tests.ratslam.mapping.map_cases import BIAS, CELL, LAP, TRUE, drive, new_map
@@ -31,7 +26,7 @@ def test_without_a_calibration_the_map_starts_from_zero():
     config = KeyframeMapConfig()
     expected = CalibrationPrior(0.0, config.bias_sd / CELL, 0.0, config.turn_error_sd)
     assert starting_calibration(config, CELL) == expected
-    assert starting_noise(config) == HeadingNoise()
+    assert HeadingNoise.of_start(config) == HeadingNoise()
 
 
 def test_what_is_written_is_what_the_next_session_starts_from(tmp_path):
@@ -40,7 +35,7 @@ def test_what_is_written_is_what_the_next_session_starts_from(tmp_path):
     text = (tmp_path / "calibration.yaml").read_text()
     config = KeyframeMapConfig.model_validate(yaml.safe_load(text)["keyframes"])
     assert starting_calibration(config, CELL) == pytest.approx(known)
-    assert starting_noise(config).factor == pytest.approx(noise.factor)
+    assert HeadingNoise.of_start(config).factor == pytest.approx(noise.factor)
 
 
 def test_turns_without_systematic_error_have_none_to_start_from():

@@ -204,9 +204,8 @@ def test_a_visit_is_cut_out_for_sequences_of_any_evidence():
     jumps = ((2 * LAP + 45, 34), (2 * LAP + 85, -34))
     made = world(0, laps=5, jumps=jumps, least=44.0, most=45.0)
     judged = select_closures_and_cuts(made.case, made.starts(), made.find_cut)
-    whole = closure_selection.optimise_with_cuts(
-        made.case, MapFit(made.truth.copy(), 0.0, np.zeros(0)), ((jumps[0][0], 5), (jumps[1][0], 7))
-    )
+    start = MapFit(made.truth.copy(), 0.0, np.zeros(0))
+    whole = made.case.with_cuts(start, ((jumps[0][0], 5), (jumps[1][0], 7)))
     assert judged.cost <= whole.cost + 1
 
 

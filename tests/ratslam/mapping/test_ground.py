@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ratslam.mapping.ground import NEAR, Ground
 from ratslam.mapping.ground import REACH as REACH_CELLS
-from ratslam.mapping.ground import Ground, ground_of
 from ratslam.recall.config import RecallConfig, sector_shifts
 from tactile.base.se2 import compose
 from tests.ratslam.places.alignment_cases import (
@@ -85,10 +85,10 @@ def test_a_single_keyframe_is_one_place() -> None:
 )
 def test_a_turned_robot_sees_shifted_views(recall: dict, angle: float, least: float) -> None:
     config = RecallConfig.model_validate(recall)
-    ground = ground_of(np.zeros((1, 3)), config, 0.05, angle, VARIANCE)
+    shifts = sector_shifts(config)
+    ground = Ground.of(np.zeros((1, 3)), shifts, 0.05, angle, VARIANCE, NEAR)
     assert ground.reach == pytest.approx(REACH_CELLS * 0.05)
     assert ground.reach_heading == pytest.approx(least)
-    shifts = sector_shifts(config)
     assert len(ground.turns) == len(shifts)
     claimed = ground.claims(np.arange(len(shifts)), np.zeros(len(shifts), int))
     expected = compose(np.zeros((len(shifts), 3)), np.array([[0, 0, -k * angle] for k in shifts.tolist()]))

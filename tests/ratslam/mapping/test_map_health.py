@@ -11,10 +11,10 @@ from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.map_solution import (
     CONTROLS,
     DOUBTED,
+    MapSolution,
     claimed_revisits,
     claims_cost,
     health_features,
-    solved_map,
     worse_than_odometry,
 )
 from tactile.base.se2 import compose
@@ -51,7 +51,7 @@ def test_a_map_without_closures_is_odometry_and_not_doubted(graph):
     log = closed(FALSE)
     for sequence in range(log.sequences):
         log.judge(sequence, Verdict.OPEN)
-    assert np.isnan(worse_than_odometry(graph, solved_map(graph, log)))
+    assert np.isnan(worse_than_odometry(graph, MapSolution.solved(graph, log)))
 
 
 def test_closures_of_little_weight_are_closures(graph):

@@ -11,7 +11,6 @@ from ratslam.mapping.closure_selection import (
     KEPT,
     MapHypotheses,
     SelectionProblem,
-    optimise_with_cuts,
     select_closures,
 )
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, MapProblem, OdometryChain, System
@@ -63,7 +62,7 @@ def same(one: list[MapFit], other: list[MapFit]) -> bool:
 @pytest.mark.parametrize("at", TRAPS)
 def test_the_beam_escapes_from_a_false_early_sequence(at):
     made = trap(*at)
-    trapped = optimise_with_cuts(made.case, made.reckoned(), ())
+    trapped = made.case.with_cuts(made.reckoned(), ())
     assert (trapped.fit.weights[made.false] > ACCEPTED_WEIGHT).all()
     assert off(trapped.fit, made.truth) > 0.15
     found = select_closures(made.case, made.starts())

@@ -220,13 +220,11 @@ def test_m3500_reaches_the_optimum_of_gtsam(m3500):
 def test_relaxation_leaves_exact_graphs_and_pulls_others_together():
     truth, edges = loops(np.random.default_rng(2), 30, 5)
     motion = edges.motion
-    columns = (np.hypot(motion[:, 0], motion[:, 1]), np.arctan2(motion[:, 1], motion[:, 0]), motion[:, 2])
-    assert np.abs(relax(truth, edges.i, edges.j, *columns, 20, 0.5) - truth).max() < 1e-12
+    length, bearing = np.hypot(motion[:, 0], motion[:, 1]), np.arctan2(motion[:, 1], motion[:, 0])
+    links = edges.i, edges.j, length, bearing, motion[:, 2]
+    assert np.abs(relax(truth, links, 20, 0.5) - truth).max() < 1e-12
     bent = truth + np.random.default_rng(3).normal(0, 0.05, truth.shape)
-    errors = [
-        np.abs(difference_error(relax(bent, edges.i, edges.j, *columns, n, 0.5), *edges[:3])[0]).max()
-        for n in (0, 50)
-    ]
+    errors = [np.abs(difference_error(relax(bent, links, n, 0.5), *edges[:3])[0]).max() for n in (0, 50)]
     assert errors[1] < errors[0] / 5
 
 

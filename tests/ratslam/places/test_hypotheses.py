@@ -120,7 +120,7 @@ def test_the_order_of_proposals_does_not_matter(seed: int, order: list[int]) -> 
             known.propose(LOOP.ground, ODDS, views, LOOP.poses[frame])
         for moved, gain in zip(motions[10:], gains[10:], strict=True):
             views.append(moved, gain)
-            known.advance(LOOP.ground, ODDS, moved, gain)
+            known.advance(LOOP.ground, ODDS, moved, gain, None)
         return known
 
     np.testing.assert_array_equal(table(follow(sorted(order))), table(follow(order)))
@@ -135,7 +135,7 @@ def test_the_frame_of_the_map_does_not_matter(seed: int, change: np.ndarray) -> 
         known, views = Hypotheses(), recorded(motions[:10], gains[:10])
         known.propose(ground, ODDS, views, pose)
         for moved, gain in zip(motions[10:], gains[10:], strict=True):
-            known.advance(ground, ODDS, moved, gain)
+            known.advance(ground, ODDS, moved, gain, None)
         return known
 
     one = follow(LOOP.ground, truth[9])
@@ -152,7 +152,7 @@ def test_of_two_poses_that_become_one_the_likelier_remains() -> None:
         known.propose(LOOP.ground, ODDS, views, pose)
     assert known.count == 2  # the third is like the second
     for moved, gain in zip(motions[10:], gains[10:], strict=True):
-        known.advance(LOOP.ground, ODDS, moved, gain)
+        known.advance(LOOP.ground, ODDS, moved, gain, None)
     assert known.count == 1
     assert np.hypot(*(known.at(0).pose - truth[-1])[:2]) < REACH
     assert 0 <= known.fall(0) < known.log_odds.rows[0] / 2
@@ -165,7 +165,7 @@ def test_hopeless_poses_are_dropped() -> None:
     views.append(still, np.full((1, 1), 2.0))
     known.propose(ground, ODDS, views, np.zeros(3))
     for _ in range(30):
-        known.advance(ground, ODDS, still, np.full((1, 1), -4.0))
+        known.advance(ground, ODDS, still, np.full((1, 1), -4.0), None)
     assert known.count == 0
     known.propose(ground, ODDS, views, np.zeros(3))
     known.clear()
@@ -183,7 +183,7 @@ def test_restored_hypotheses_and_views_go_on_to_the_same_bits() -> None:
     for moved, gain in zip(motions[10:], gains[10:], strict=True):
         for one, of in ((known, views), (again, seen)):
             of.append(moved, gain)
-            one.advance(LOOP.ground, ODDS, moved, gain)
+            one.advance(LOOP.ground, ODDS, moved, gain, None)
             one.propose(LOOP.ground, ODDS, of, LOOP.poses[70])
     for one, other in ((known, again), (views, seen)):
         expected, found = one.arrays(), other.arrays()

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from ratslam.mapping.ground import (
     COMMON,
-    COMMON_OF_PIECE,
+    PIECE_COMMON,
     PIECE_WEIGHTING,
     SESSION_WEIGHTING,
     less_where_common,
@@ -42,7 +42,7 @@ def test_a_better_fit_everywhere_counts_in_part(gain: np.ndarray, more: float) -
 
 @given(GAINS)
 def test_a_view_on_a_growing_map_loses_less_than_one_on_a_finished_map(gain: np.ndarray) -> None:
-    lost = COMMON_OF_PIECE / COMMON * (gain - SESSION_WEIGHTING.weigh(gain))
+    lost = PIECE_COMMON / COMMON * (gain - SESSION_WEIGHTING.weigh(gain))
     np.testing.assert_allclose(gain - PIECE_WEIGHTING.weigh(gain), lost, atol=1e-9)
 
 
