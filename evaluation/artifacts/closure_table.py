@@ -50,16 +50,12 @@ def read_closure_table(directory: Path) -> ClosureTable:
     file = directory / "closures.csv"
     if not file.exists():
         return ClosureTable(np.zeros((0, 2), int), [], {})
-    expected = "the columns step, match_step, verdict, and numbers in all others"
-    rows = read_rows(
-        file,
-        expected,
-        lambda row: (
-            [int(np.int32(row[name])) for name in ("match_step", "step")],
-            str(row["verdict"]),
-            {name: float(row[name]) for name in row if name not in KEYS},
-        ),
-    )
+
+    def parse(row: Mapping[str, str]) -> tuple[list[int], str, dict[str, float]]:
+        pair = [int(np.int32(row[name])) for name in ("match_step", "step")]
+        return pair, str(row["verdict"]), {name: float(row[name]) for name in row if name not in KEYS}
+
+    rows = read_rows(file, "the columns step, match_step, verdict, and numbers in all others", parse)
     names = list(rows[0][2]) if rows else []
     steps, verdicts, evidence = zip(*rows, strict=True) if rows else ((), (), ())
     columns = np.array([list(cells.values()) for cells in evidence], float).reshape(len(rows), len(names)).T
@@ -99,9 +95,8 @@ def count_closures(path: Path) -> Closures | None:
     table = read_closure_table(path)
     accepted = table.accepted()
     sequence = table.evidence.get("sequence", np.arange(len(accepted)))
-    return Closures(
-        len(accepted), int(accepted.sum()), len(np.unique(sequence)), len(np.unique(sequence[accepted]))
-    )
+    sequences = len(np.unique(sequence)), len(np.unique(sequence[accepted]))
+    return Closures(len(accepted), int(accepted.sum()), *sequences)
 
 
 CHANGES = "changes.csv"
@@ -147,9 +142,7 @@ class ChangeRow(NamedTuple):
 def write_changes(path: Path, changes: Sequence[ChangeRow]) -> None:
     """Writes the places, the surest first."""
     with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows(changes)
+        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *changes])
 
 
 def read_changes(path: Path) -> list[ChangeRow]:

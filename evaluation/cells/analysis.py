@@ -111,8 +111,7 @@ def write_scores(path: Path, scores: CellScores) -> None:
 
     def write(temporary: Path) -> None:
         with temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(CellScores._fields)
-            writer.writerows(zip(*(column.tolist() for column in scores), strict=True))
+            rows = zip(*(column.tolist() for column in scores), strict=True)
+            csv.writer(file, lineterminator="\n").writerows([CellScores._fields, *rows])
 
     write_atomically(path, write)

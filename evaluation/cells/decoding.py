@@ -3,6 +3,7 @@ the activity packet, its decoded pose minus the true pose over time (Burak & Fie
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -68,9 +69,8 @@ def decode_positions(
     samples = box_samples(recording.time, recording.truth, recording.activity, *edges, 1)
     number = ((samples.time - samples.time[0]) // block).astype(int)
     if number[-1] < 3:
-        raise InputError(
-            "recording", f"{samples.time[-1] - samples.time[0]:.1f} s", f"four blocks of {block} s"
-        )
+        length = samples.time[-1] - samples.time[0]
+        raise InputError("recording", f"{length:.1f} s", f"four blocks of {block} s")
     halves = [_decode_half(samples, number % 2 == half, edges, window, smoothing) for half in (0, 1)]
     time, truth, decoded = (np.concatenate(parts) for parts in zip(*halves, strict=True))
     order = np.argsort(time, kind="stable")
@@ -108,11 +108,7 @@ def log_posterior(
 
 
 def _decode_half(
-    samples: BoxSamples,
-    train: np.ndarray,
-    edges: tuple[np.ndarray, np.ndarray],
-    seconds: float,
-    smoothing: float,
+    samples: BoxSamples, train: np.ndarray, edges: Sequence[np.ndarray], seconds: float, smoothing: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times [M] s, true and decoded places [M, 2] m of the windows of `seconds` outside `train` [samples]
     bool."""
@@ -122,10 +118,8 @@ def _decode_half(
     _, window = np.unique((test.time - samples.time[0]) // seconds, return_inverse=True)
     spent = np.bincount(window, test.seconds)
     counts = _sum_windows(window, test.activity * test.seconds[:, None])
-    time, truth = (
-        _sum_windows(window, each) / np.bincount(window)[:, None]
-        for each in (test.time[:, None], test.position)
-    )
+    size = np.bincount(window)[:, None]
+    time, truth = (_sum_windows(window, each) / size for each in (test.time[:, None], test.position))
     posterior = log_posterior(counts, spent, rates, np.zeros(rates.shape[1:]))
     row, column = np.divmod(posterior.reshape(len(counts), -1).argmax(axis=1), rates.shape[2])
     x, y = ((each[1:] + each[:-1]) / 2 for each in edges)
@@ -153,9 +147,8 @@ def packet_drift(recording: CellRecording) -> np.ndarray:
     known = np.flatnonzero(known_poses(moved))
     wrapped = recording.packet_pose - moved
     error = np.full(wrapped.shape, np.nan)
-    error[known] = np.stack(
-        [np.unwrap(wrapped[known, i], period=side) for i, side in enumerate(recording.torus_sides)], axis=1
-    )
+    sides = enumerate(recording.torus_sides)
+    error[known] = np.stack([np.unwrap(wrapped[known, i], period=side) for i, side in sides], axis=1)
     error[known] -= error[known[0]]
     return error
 

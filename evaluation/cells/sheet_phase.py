@@ -42,10 +42,8 @@ def folded_maps(recording: CellRecording, bins: int = 21) -> tuple[np.ndarray, n
     check_lengths(recording.time, recording.activity)
     path = truth_in_sheet(recording)
     known = known_poses(path)
-    width, height, _ = recording.torus_sides
-    column, row = (
-        circle_bin(2 * np.pi * path[known, i] / side, bins) for i, side in enumerate((width, height))
-    )
+    angles = (2 * np.pi * path[known, i] / side for i, side in enumerate(recording.torus_sides[:2]))
+    column, row = (circle_bin(angle, bins) for angle in angles)
     spent = sample_seconds(recording.time)[known]
     seconds, sums = sum_into(row * bins + column, spent, recording.activity[known], (bins, bins))
     return sums / np.where(seconds > 0, seconds, np.nan), seconds

@@ -264,24 +264,17 @@ def score_grid(grid: OccupancyGrid, truth: GridTruth, name: str = "map") -> Grid
     grid.check(truth)
     surface = touchable_surface(grid, truth)
     findings = _cells(grid, surface) | _chamfer(grid, truth, surface)
-    return GridScore(
-        name=name,
-        errors=tuple(grid_error(grid, truth, surface, convention) for convention in CONVENTIONS),
-        quantities={metric.name: metric.quantity(findings[metric.name]) for metric in GRID_METRICS},
-    )
+    errors = tuple(grid_error(grid, truth, surface, convention) for convention in CONVENTIONS)
+    quantities = {metric.name: metric.quantity(findings[metric.name]) for metric in GRID_METRICS}
+    return GridScore(name=name, errors=errors, quantities=quantities)
 
 
 def pool_grids(scores: Sequence[GridScore], name: str) -> GridScore:
     """The mean of the scores of single trials (the score of the mean map would hide half the error)."""
-    return GridScore(
-        name=name,
-        trials=len(scores),
-        errors=tuple(_pool_errors(each) for each in zip(*(score.errors for score in scores), strict=True)),
-        quantities={
-            metric.name: Quantity.pool([score.quantities[metric.name] for score in scores])
-            for metric in GRID_METRICS
-        },
-    )
+    errors = tuple(_pool_errors(each) for each in zip(*(score.errors for score in scores), strict=True))
+    names = [metric.name for metric in GRID_METRICS]
+    quantities = {one: Quantity.pool([score.quantities[one] for score in scores]) for one in names}
+    return GridScore(name=name, trials=len(scores), errors=errors, quantities=quantities)
 
 
 def render_grid_scores(scores: Sequence[GridScore]) -> str:

@@ -25,6 +25,7 @@ _ROW, _GAP, _MARKS, _BOTTOM, _KEY = 0.062, 0.5, 0.22, 0.62, 1.25  # inches
 _FLATTEST, _TALLEST = 0.35, 1.3
 _REACH = 0.078  # radius of a drawn head, m; fits between the walls of a maze cell
 _LARGEST, _LEAST = 0.08, 0.045  # limits of the radius as shares of the scene
+_COLORS = "viridis_r"  # of heights, as shares of the tallest
 _HOLE = 0.28  # share of the radius without whiskers
 
 
@@ -40,6 +41,7 @@ def draw_whiskers(
     Raises:
         InputError: the numbers of images and steps differ.
     """
+    from matplotlib import colormaps
     from matplotlib.colors import to_rgb
 
     if len(images.view) != len(run.time):
@@ -71,7 +73,7 @@ def draw_whiskers(
     line = f"{len(images.view)} whisks  ·  {heads}  ·  {touched:.0%} of whiskers in contact"
     figure = style.new_figure(total, card.name, line)
 
-    pixels, bottom = _colors(images.view), total - style.TOP - _MARKS + _GAP
+    pixels, bottom = colormaps[_COLORS](images.view)[..., :3], total - style.TOP - _MARKS + _GAP
     pixels[images.view == 0] = to_rgb(_NOTHING)
     pixels[~images.alive] = to_rgb(_DEAD)
     for part in parts:
@@ -108,13 +110,6 @@ def _spread(pose: np.ndarray, steps: np.ndarray, apart: float) -> np.ndarray:
         chosen.append(int(away.argmax()))
         away = np.minimum(away, np.hypot(*(place - place[chosen[-1]]).T))
     return np.sort(steps[chosen])
-
-
-def _colors(share: np.ndarray) -> np.ndarray:
-    """The colours [..., 3] of heights, given as shares [...] of the tallest."""
-    import matplotlib
-
-    return matplotlib.colormaps["viridis_r"](share)[..., :3]
 
 
 def _paint_strip(
@@ -181,16 +176,8 @@ def _paint_key(figure: style.Figure, images: WhiskerViews, left: float, high: fl
         axes.text(0, -out, f"{1000 * length:.0f}", size=6.5, color=INK, ha="center", va="center", zorder=5)
 
     tall = max(0.5, min(1.6, high - size - 1.0))
-    bar = style.add_axes(figure, left + 0.35, top - size - 0.35 - tall, 0.16, tall)
-    bar.imshow(
-        _colors(np.linspace(0, 1, 256))[:, None],
-        extent=(0, 1, 0, 1000 * images.tallest),
-        origin="lower",
-        aspect="auto",
-    )
-    bar.set_xticks([])
-    bar.yaxis.tick_right()
-    bar.set_title("height (mm)", fontsize=8, color=LABEL_GREY, loc="left", pad=8)
+    box = left + 0.35, top - size - 0.35 - tall, 0.16, tall
+    style.add_scale(figure, box, _COLORS, 1000 * images.tallest, "height (mm)", 8)
     across, up = figure.get_size_inches()
     handles = [Patch(facecolor=_NOTHING, edgecolor=LABEL_GREY, lw=0.4, label="no contact")]
     if not images.alive.all():

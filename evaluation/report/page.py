@@ -141,22 +141,12 @@ def _run_context(
     """What the template `run.html` shows of a run."""
     return {
         "number": number,
-        "name": report.name,
-        "status": report.describe_status(),
+        "report": report,
         "unfinished": report.manifest.status == RUNNING,
-        "backend": report.backend,
-        "source": report.source,
-        "manifest": report.manifest,
-        "verdict": report.verdict,
-        "warnings": report.run.warnings,
         "score": describe_score(report.card),
         "figures": _key_figures(report),
-        "sections": report.card.lines(),
-        "closures": len(report.closures.verdicts),
-        "views": report.views is not None,
         "charts": [(name, *_CAPTIONS[name]) for name in charts if name != "map"],
         "settings": settings,
-        "files": report.files,
     }
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from ratslam.cli.common import INPUT_ERROR, Commands, add_config, positive_integer, prepare_jax, read_config
 from ratslam.runs.settings.packaged import find_config
@@ -69,7 +69,7 @@ def add_commands(commands: Commands) -> None:
     )  # fmt: skip
 
 
-class _Progress:
+class _Progress(AbstractContextManager["_Progress"]):
     """A progress bar over runs, which collects the failed ones.
 
     Args:
@@ -83,9 +83,6 @@ class _Progress:
 
         self._bar = tqdm(total=total, unit=unit, file=sys.stderr, mininterval=0.5, delay=1.0)
 
-    def __enter__(self) -> Self:
-        return self
-
     def __call__(self, record: Any) -> None:
         """Counts a run."""
         if record.error is not None:
@@ -96,9 +93,7 @@ class _Progress:
         """Counts runs that did not fail."""
         self._bar.update(runs)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *details: object) -> None:
         self._bar.close()
         if kind is KeyboardInterrupt:
             tell(f"{self._bar.n} {self._bar.unit}s are kept in {self._path}; the same command continues")
@@ -222,13 +217,7 @@ def _size(arguments: argparse.Namespace) -> int:
     if arguments.cycles < FEWEST_CYCLES:
         raise InputError("--cycles", str(arguments.cycles), f"{FEWEST_CYCLES} or more")
     _prepare()
-    from evaluation.studies.recommendation import (
-        changed_settings_yaml,
-        recommend,
-        render_recommendations,
-        render_trial_runs,
-        try_settings,
-    )
+    from evaluation.studies import recommendation as advice
     from evaluation.studies.scene_statistics import scene_of, with_tier
     from ratslam.runs.build_session import open_source
     from ratslam.runs.settings.completion import complete
@@ -236,12 +225,12 @@ def _size(arguments: argparse.Namespace) -> int:
     path, config = arguments.config, read_config(arguments)
     with open_source(with_tier(config, "kinematic")) as source:
         scene, config = scene_of(source), complete(config, source)
-    found = recommend(config, scene)
+    found = advice.recommend(config, scene)
     print("trial runs take a minute or two, and several on a busy machine", flush=True)
-    print(f"{scene.describe()}\n\n{render_recommendations(found)}\n", flush=True)
-    runs = try_settings(config, found, arguments.cycles)
+    print(f"{scene.describe()}\n\n{advice.render_recommendations(found)}\n", flush=True)
+    runs = advice.try_settings(config, found, arguments.cycles)
     print(f"Cost of each cheaper step, over {runs[0].steps} of {scene.cycles} cycles, one seed:\n")
-    print(render_trial_runs(runs))
-    text = changed_settings_yaml(found)
+    print(advice.render_trial_runs(runs))
+    text = advice.changed_settings_yaml(found)
     print(f"\nFor {path.name}:\n\n{text}" if text else f"\n{path.name} has these settings already")
     return 0

@@ -181,10 +181,8 @@ class Executor(ExitStack):
                 result = future.result()
             except Exception as error:
                 if self._scheduler is not None and isinstance(error, futures.CancelledError):
-                    cure = "what was done is kept; run it again"
-                    raise InputError(
-                        "--scheduler", "the scheduler went away", "one that stays", cure
-                    ) from None
+                    found, cure = "the scheduler went away", "what was done is kept; run it again"
+                    raise InputError("--scheduler", found, "one that stays", cure) from None
                 unloadable = isinstance(error, ImportError) or "deserialization" in str(error)
                 if self._scheduler is not None and unloadable:
                     found = f"its processes cannot load ratslam ({error})".splitlines()[0]

@@ -26,14 +26,7 @@ from evaluation.metrics.trajectory import ate
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, PURPLE, VERMILLION
 from evaluation.studies.executor import Executor
-from evaluation.studies.machine import (
-    Machine,
-    compilations,
-    machine,
-    peak_memory,
-    reset_peak_memory,
-    watch_load,
-)
+from evaluation.studies.machine import Machine, compilations, watch_machine
 from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE, closure_errors
 from evaluation.studies.perturbation import repeat_course
 from evaluation.studies.run_job import KILLED, read_records
@@ -268,8 +261,7 @@ def measure_growth(task: _GrowthTask, done: Callable[[], object] = lambda: None)
         rows, clock = read_observations(source), _StepClock()
         truth, motion = list[np.ndarray](), list[np.ndarray]()
         for before, length in pairwise([0, *task.lengths]):
-            load = watch_load()
-            reset_peak_memory()
+            watched = watch_machine()
             window = min(task.window or length, length - before)
             for step, (sample, observation) in enumerate(islice(rows, length - before)):
                 if step == length - before - window:
@@ -279,12 +271,11 @@ def measure_growth(task: _GrowthTask, done: Callable[[], object] = lambda: None)
                 truth.append(sample.truth)
                 motion.append(np.asarray(observation.odometry[:3], float))
                 done()
-            times = clock.read() | {"memory": peak_memory()}
-            here = machine().model_copy(update={"other_load": load()})
+            times, (memory, here) = clock.read(), watched()
             errors = _errors(session, np.array(truth), integrate(np.array(motion)))
-            keyframes = session.backend.rows(session.state)
-            found = {"keyframes": keyframes, "machine": here, **times, **errors}
-            yield _GrowthRow.model_validate({"ground": task.ground, "steps": length, **found})
+            found = {"keyframes": session.backend.rows(session.state), "memory": memory, "machine": here}
+            found |= {"ground": task.ground, "steps": length, **times, **errors}
+            yield _GrowthRow.model_validate(found)
 
 
 def _errors(session: Session, truth: np.ndarray, odometry: np.ndarray) -> dict[str, float]:

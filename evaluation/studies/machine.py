@@ -127,6 +127,13 @@ def machine() -> Machine:
     )
 
 
+def watch_machine() -> Callable[[], tuple[float, Machine]]:
+    """A function for the peak memory since, MiB, and this machine with the load of other processes since."""
+    load = watch_load()
+    reset_peak_memory()
+    return lambda: (peak_memory(), machine().model_copy(update={"other_load": load()}))
+
+
 class Stopwatch:
     """Measures a run and its calls of one or more steps, apart from compilation."""
 

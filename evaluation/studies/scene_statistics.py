@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.metrics.metric import Finding, Quantity
-from evaluation.studies.metrics import image_difference, quantity
+from evaluation.studies.metrics import image_difference, quantities_of
 from evaluation.studies.study import with_settings
 from ratslam.runs.build_session import open_observations, open_source
 from ratslam.runs.run import open_recorder
@@ -42,11 +42,9 @@ def compare_with_tier(config: RunConfig, log: InMemorySource, cost: float, tier:
     reference = _reference_views(with_tier(config, tier).model_dump_json())
     contact, height = image_difference(log.views, reference, config.touch.image.tallest)
     duration = float(log.time[-1] - log.time[0])
-    return (
-        quantity("simulation_time", Finding(1e6 * cost / duration))
-        | quantity("contact_difference", Finding(contact))
-        | quantity("height_difference", Finding(1e3 * height))
-    )
+    findings = {"simulation_time": 1e6 * cost / duration, "contact_difference": contact}
+    findings["height_difference"] = 1e3 * height
+    return quantities_of({name: Finding(value) for name, value in findings.items()})
 
 
 def with_tier(config: RunConfig, tier: str) -> RunConfig:

@@ -81,17 +81,6 @@ def plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[_Row]:
-    """A row for each name and combination, in their order; last that of raw odometry if asked for."""
-    groups: dict[str, list[RunRecord]] = {}
-    for record in records:
-        groups.setdefault(json.dumps([record.row, record.varied]), []).append(record)
-    rows = [_row(group) for group in groups.values()]
-    if odometry and groups:
-        rows.append(_row(next(iter(groups.values())), odometry=True))
-    return rows
-
-
 def _mark_optimal(rows: Sequence[_Row], objectives: Mapping[str, Direction], statistic: str) -> list[_Row]:
     """The rows with `optimal` set by the mean or median of each objective.
 
@@ -123,10 +112,8 @@ def _row(group: Sequence[RunRecord], odometry: bool = False) -> _Row:
     fine = [record for record in group if record.error is None]
     names = dict.fromkeys([metric.name for metric in MEASURED])
     names |= dict.fromkeys(each for record in fine for each in record.quantities)
-    spreads = {
-        each: spread([run.odometry(each) if odometry else run.value(each) for run in fine], each)
-        for each in names
-    }
+    value = RunRecord.odometry if odometry else RunRecord.value
+    spreads = {each: spread([value(run, each) for run in fine], each) for each in names}
     return _Row(
         row=DEAD_RECKONING if odometry else group[0].row,
         varied={} if odometry else group[0].varied,
@@ -321,7 +308,12 @@ def make_report(
             whether the records are of the trials of a search; then the Pareto-optimal ones are marked.
     """
     kind = "search" if search else plan.report
-    rows = _summarise(records, odometry=kind in ("medians", "differences"))
+    groups: dict[str, list[RunRecord]] = {}
+    for record in records:
+        groups.setdefault(json.dumps([record.row, record.varied]), []).append(record)
+    rows = [_row(group) for group in groups.values()]
+    if groups and kind in ("medians", "differences"):
+        rows.append(_row(next(iter(groups.values())), odometry=True))
     if kind != "pareto":
         error = None
     elif error is None:  # the first default error that most rows have in all of their runs
