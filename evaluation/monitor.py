@@ -10,6 +10,7 @@ import time
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from math import atan2
 from pathlib import Path
 from typing import NamedTuple
@@ -181,10 +182,8 @@ class RunMonitor:
         """Time of the last write to these files, s; 0 without any."""
         dates = [0.0]
         for name in names:
-            try:
+            with suppress(OSError):  # not written yet, or just renamed
                 dates.append((self.directory / name).stat().st_mtime)
-            except OSError:
-                continue  # not written yet, or just renamed
         return max(dates)
 
 

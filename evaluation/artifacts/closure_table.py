@@ -56,11 +56,10 @@ def read_closure_table(directory: Path) -> ClosureTable:
         return pair, str(row["verdict"]), {name: float(row[name]) for name in row if name not in KEYS}
 
     rows = read_rows(file, "the columns step, match_step, verdict, and numbers in all others", parse)
-    names = list(rows[0][2]) if rows else []
-    steps, verdicts, evidence = zip(*rows, strict=True) if rows else ((), (), ())
-    columns = np.array([list(cells.values()) for cells in evidence], float).reshape(len(rows), len(names)).T
-    counted = np.array(steps, int).reshape(-1, 2) - first_step(directory)
-    return ClosureTable(counted, list(verdicts), dict(zip(names, columns, strict=True)))
+    names = rows[0][2] if rows else {}
+    evidence = {name: np.array([cells[name] for _, _, cells in rows]) for name in names}
+    steps = np.array([pair for pair, _, _ in rows], int).reshape(-1, 2) - first_step(directory)
+    return ClosureTable(steps, [verdict for _, verdict, _ in rows], evidence)
 
 
 def read_closures(directory: Path) -> np.ndarray:
@@ -121,11 +120,10 @@ class ChangeRow(NamedTuple):
     @classmethod
     def parse(cls, line: Mapping[str, str]) -> ChangeRow:
         """The place of a line of the file; a ValueError for a line that is malformed."""
-        x, y, extent, evidence, alarms = (
-            float(line[name]) for name in ("x", "y", "extent", "evidence", "alarms")
-        )
-        if not np.isfinite([x, y, extent, evidence, alarms]).all():
+        numbers = [float(line[name]) for name in ("x", "y", "extent", "evidence", "alarms")]
+        if not np.isfinite(numbers).all():
             raise ValueError("a number that is not finite")
+        x, y, extent, evidence, alarms = numbers
         passes, first, last = (int(np.int32(line[name])) for name in ("passes", "first_step", "last_step"))
         return cls(x, y, extent, str(line["kind"]), evidence, alarms, passes, first, last)
 

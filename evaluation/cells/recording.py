@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -84,12 +85,7 @@ def write_recording(path: str | Path, recording: CellRecording) -> None:
     sums = recording.sums or BinnedSums(*(np.zeros(0) for _ in BinnedSums._fields))
     arrays: dict[str, Any] = {name: value for name, value in recording._asdict().items() if name != "sums"}
     arrays |= {_SUMS + name: value for name, value in sums._asdict().items()}
-
-    def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, format=np.array(FORMAT), **arrays)
-
-    write_atomically(Path(path), write)
+    write_atomically(Path(path), partial(np.savez_compressed, format=np.array(FORMAT), **arrays))
 
 
 def read_recording(path: str | Path) -> CellRecording:
@@ -101,9 +97,8 @@ def read_recording(path: str | Path) -> CellRecording:
     own = [name for name in CellRecording._fields if name != "sums"]
     names = ["format", *own, *(_SUMS + name for name in BinnedSums._fields)]
 
-    def parse(
-        kind: np.ndarray, shape: np.ndarray, cell_size: np.ndarray, *arrays: np.ndarray
-    ) -> CellRecording:
+    def parse(*found: np.ndarray) -> CellRecording:
+        kind, shape, cell_size, *arrays = found
         if kind.shape or str(kind) != FORMAT:
             raise ValueError(f"the format {str(kind)[:40]!r}")
         sums = BinnedSums(*arrays[len(own) - 2 :])

@@ -117,17 +117,11 @@ def grid_error(
 
 def _pool_errors(errors: Sequence[GridError]) -> GridError:
     """The mean of the errors of several trials, under the same convention."""
-    every = [error.error for error in errors]
-    error, best = _mean(every), _mean([each.best for each in errors])
-    return GridError(
-        convention=errors[0].convention,
-        error=error,
-        spread=float(np.std(every, ddof=1)) if len(every) > 1 else None,
-        prior=_mean([each.prior for each in errors]),
-        best=best,
-        coin=_mean([each.coin for each in errors]),
-        skill=_skill(error, best),
-    )
+    every = {name: [getattr(one, name) for one in errors] for name in ("error", "prior", "best", "coin")}
+    means = {name: _mean(values) for name, values in every.items()}
+    spread = float(np.std(every["error"], ddof=1)) if len(errors) > 1 else None
+    skill = _skill(means["error"], means["best"])
+    return errors[0].model_copy(update=means | {"spread": spread, "skill": skill})
 
 
 def smooth_truth(values: np.ndarray) -> np.ndarray:

@@ -147,8 +147,7 @@ def _paint_head(
     centre, middle = (float(pose[0]), float(pose[1])), np.degrees(pose[2] + azimuth)
     wedges = [
         Wedge(centre, hole + (ring + 1) * thick, middle[column] - half, middle[column] + half, width=thick)
-        for ring in range(rings)
-        for column in range(columns)
+        for ring, column in np.ndindex(rings, columns)
     ]
     face = pixels.reshape(-1, 3)
     axes.add_patch(Circle(centre, reach, facecolor="white", edgecolor=GREY, lw=0.7, zorder=2.9))

@@ -87,13 +87,14 @@ def write_page(path: Path, runs: Sequence[PageRun], citation: str) -> None:
     reports = [report for report, _ in runs]
     charts = [run_charts(report) for report in reports]
     shown = {"overlay": overlay_chart(reports), "errors": error_chart(reports)} if len(runs) > 1 else {}
-    compared = {name: _figure_data(chart) for name, chart in shown.items() if chart is not None}
+    # Figures as plain data; their arrays of numbers are encoded as bytes.
+    compared = {name: json.loads(chart.to_json()) for name, chart in shown.items() if chart is not None}
     data = {
         "palette": PALETTE,
         "gridScales": GRID_SCALES,
         "runs": [
             {
-                "charts": {name: _figure_data(chart) for name, chart in drawn.items()},
+                "charts": {name: json.loads(chart.to_json()) for name, chart in drawn.items()},
                 "closures": closure_records(report.closures, report.run),
                 "views": view_records(report.views),
             }
@@ -128,11 +129,6 @@ def embedded_json(data: Any) -> str:
     """JSON in which no text can end the element around it."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _figure_data(figure: Any) -> Any:
-    """A figure as plain data; arrays of numbers are encoded as bytes."""
-    return json.loads(figure.to_json())
 
 
 def _run_context(

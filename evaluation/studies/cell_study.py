@@ -286,10 +286,8 @@ def _draw_rate_maps(
             axes = style.add_axes(figure, style.LEFT + column * (side + _MAP_GAP), bottom, side, side)
             draw_rate_map(axes, rates, x_edges, y_edges)
             axes.set_title(f"{np.nanmax(rates):.2g}", fontsize=7, color=LABEL_GREY, pad=2)
-        figure.text(
-            0.5 * style.LEFT / WIDTH, (bottom + side / 2) / height, name, rotation=90, fontsize=9,
-            ha="center", va="center", color=style.INK,
-        )  # fmt: skip
+        at = 0.5 * style.LEFT / WIDTH, (bottom + side / 2) / height
+        figure.text(*at, name, rotation=90, fontsize=9, ha="center", va="center", color=style.INK)
     return figure
 
 

@@ -34,15 +34,12 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
-    study = commands.add(
-        "study", _study, "run many configurations over seeds and compare them",
-        "study study_maze", "study",
-    )  # fmt: skip
+    does = "run many configurations over seeds and compare them"
+    study = commands.add("study", _study, does, "study study_maze", "study")
     add_config(study, "study file, or a configuration with --preset (YAML)")
     study.add_argument("--preset", choices=PRESETS, help="make the study from a configuration")
-    study.add_argument(
-        "--search", action="store_true", help="search parameters by the study's `tune` section"
-    )
+    tune = "search parameters by the study's `tune` section"
+    study.add_argument("--search", action="store_true", help=tune)
     study.add_argument(
         "--workers", type=positive_integer, metavar="N",
         help="Dask processes (default: one per core; 1 without Dask, and 1 with `report: pareto`, so that no "
@@ -63,10 +60,8 @@ def add_commands(commands: Commands) -> None:
 
     size = commands.add("size", _size, "recommend settings for a scene", "size whisker_maze", "study")
     add_config(size)
-    size.add_argument(
-        "--cycles", type=positive_integer, default=CYCLES, metavar="N",
-        help=f"length of the trial session (default {CYCLES})",
-    )  # fmt: skip
+    length = f"length of the trial session (default {CYCLES})"
+    size.add_argument("--cycles", type=positive_integer, default=CYCLES, metavar="N", help=length)
 
 
 class _Progress(AbstractContextManager["_Progress"]):

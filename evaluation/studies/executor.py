@@ -172,10 +172,8 @@ class Executor(ExitStack):
         """(index, result) in the order of completion, without those of processes that were killed."""
         environment = {name: os.environ[name] for name in ENVIRONMENT if name in os.environ}
         pool = self._client.get_executor(pure=False)
-        pending = {
-            pool.submit(_call_in_worker, environment, pickle.dumps((function, task))): index
-            for index, task in enumerate(tasks)
-        }
+        packed = (pickle.dumps((function, task)) for task in tasks)
+        pending = {pool.submit(_call_in_worker, environment, each): k for k, each in enumerate(packed)}
         for future in futures.as_completed(pending):
             try:
                 result = future.result()

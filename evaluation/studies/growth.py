@@ -364,10 +364,10 @@ def _draw(name: str, rows: Sequence[_GrowthRow]) -> Figure | None:
     for ground, color in zip(grounds, _COLORS, strict=False):
         these = [row.ground == ground for row in timed]
         for values, (statistic, dash, mark) in zip(cost[these].T, _DASHES, strict=True):
+            label = f"{ground}, {statistic}"
             axes.plot(
-                steps[these], values, dash, color=color, lw=1.5, marker=mark, ms=4.5, mew=0,
-                label=f"{ground}, {statistic}",
-            )  # fmt: skip
+                steps[these], values, dash, color=color, lw=1.5, marker=mark, ms=4.5, mew=0, label=label
+            )
     style.name_axes(axes, "length of the session (steps)", "processor time of a step (ms), own thread")
     style.add_legend(figure, axes, columns=len(grounds))
     return figure

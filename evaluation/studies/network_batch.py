@@ -156,9 +156,8 @@ class _Fleet:
             activity = cells.activity._replace(blocks=cells.activity.blocks[:1])
             states.append((cells._replace(activity=activity), packet))
         together = jax.tree.map(lambda *leaves: np.stack(leaves), *states)
-        after, track = jax.device_get(
-            _walk(self._config, self._of(members), together, rows, self._chosen, together=True)
-        )
+        these = self._of(members), together, rows, self._chosen
+        after, track = jax.device_get(_walk(self._config, *these, together=True))
         found = {}
         for j, k in enumerate(group):
             if not track.level[j].any():

@@ -187,7 +187,7 @@ ENERGY = 0.05
 
 def cheaper_steps(config: RunConfig) -> dict[str, dict[str, Any]]:
     """The next cheaper step in every direction: settings in place of the recommended ones, by name."""
-    grid, steps = config.grid, dict[str, dict[str, Any]]()
+    grid, cells, steps = config.grid, config.pose_cells, dict[str, dict[str, Any]]()
     if config.backend == "grid":
         fewer = max(2, grid.particles // FEWER)
         if fewer < grid.particles:
@@ -195,7 +195,19 @@ def cheaper_steps(config: RunConfig) -> dict[str, dict[str, Any]]:
         size = float(f"{grid.cell * COARSER:.3g}")
         steps[f"cells of {size:g} m"] = {"grid.cell": size}
     else:
-        steps = _cheaper_cells(config)
+        fewer = max(FEWEST, cells.cells_xy // 2) | 1
+        if cells.cells_xy > FEWEST:
+            steps[f"{fewer} cells"] = {"pose_cells.cells_xy": fewer}
+        size = float(f"{cells.cell_size * COARSER:.3g}")
+        across = max(FEWEST, round(cells.cells_xy / COARSER)) | 1
+        steps[f"cells of {size:g} m"] = {"pose_cells.cell_size": size, "pose_cells.cells_xy": across}
+        turns = max(12, round(cells.cells_heading / COARSER))
+        if turns < cells.cells_heading:
+            steps[f"{turns} cells of heading"] = {"pose_cells.cells_heading": turns}
+        if config.backend == "recall":
+            steps["classic backend"] = {"backend": "classic"}
+            if config.recording is None and "energy" not in config.templates.model_fields_set:
+                steps["classic backend"]["templates.energy"] = ENERGY
     if config.session.precision == "float64":
         steps["float32"] = {"session.precision": "float32"}
     if config.simulation is not None and (config.simulation.raw or config.simulation.fidelity == "dynamic"):
@@ -234,21 +246,3 @@ def render_trial_runs(records: Sequence[RunRecord]) -> str:
     plan = StudyPlan(base=Path(), pace="live", report="costs")
     failed = [f"{record.row}: {record.error}" for record in records if record.error is not None]
     return "\n".join([render(make_report("", plan, records)), *failed])
-
-
-def _cheaper_cells(config: RunConfig) -> dict[str, dict[str, Any]]:
-    cells, steps = config.pose_cells, dict[str, dict[str, Any]]()
-    if cells.cells_xy > FEWEST:
-        fewer = max(FEWEST, cells.cells_xy // 2) | 1
-        steps[f"{fewer} cells"] = {"pose_cells.cells_xy": fewer}
-    size = float(f"{cells.cell_size * COARSER:.3g}")
-    across = max(FEWEST, round(cells.cells_xy / COARSER)) | 1
-    steps[f"cells of {size:g} m"] = {"pose_cells.cell_size": size, "pose_cells.cells_xy": across}
-    turns = max(12, round(cells.cells_heading / COARSER))
-    if turns < cells.cells_heading:
-        steps[f"{turns} cells of heading"] = {"pose_cells.cells_heading": turns}
-    if config.backend == "recall":
-        steps["classic backend"] = {"backend": "classic"}
-        if config.recording is None and "energy" not in config.templates.model_fields_set:
-            steps["classic backend"]["templates.energy"] = ENERGY
-    return steps

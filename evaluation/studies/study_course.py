@@ -111,9 +111,8 @@ def _read_session(
 
     if views:
         seen = [step.evidence for step in build_session(config, source).replay(observations())]
-        template, relative, energy = (
-            np.array([getattr(each, name) for each in seen]) for name in ("template", "relative", "energy")
-        )
+        names = "template", "relative", "energy"
+        template, relative, energy = (np.array([getattr(each, name) for each in seen]) for name in names)
     else:
         template = np.full(sum(1 for _ in observations()), -1, np.int32)
         relative = energy = np.zeros(len(template))

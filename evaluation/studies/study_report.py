@@ -488,9 +488,8 @@ def find_disturbances(machines: Sequence[Machine]) -> list[str]:
     if len(builds) > 1:
         found.append(f"the records are of {len(builds)} builds of ratslam; delete them to run all again")
     if len(processors) > 1 or max((each.workers for each in machines), default=1) > 1:
-        found.append(
-            "several runs at a time, or several machines, disturb times: measure speed with --workers 1"
-        )
+        causes = "several runs at a time, or several machines, disturb times"
+        found.append(f"{causes}: measure speed with --workers 1")
     load = max((each.other_load or 0.0 for each in machines if each.workers == 1), default=0.0)
     if load > DISTURBED:
         found.append(f"other processes kept up to {load:.1f} cores busy meanwhile, which lengthens times")
