@@ -8,15 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.cells.rate_map import (
-    BoxSamples,
-    arena_edges,
-    box_samples,
-    check_lengths,
-    known_poses,
-    rate_maps,
-    sum_samples,
-)
+from evaluation.cells import rate_map
 from evaluation.cells.recording import CellRecording
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -65,8 +57,8 @@ def decode_positions(
     Raises:
         InputError: lengths differ, no pose is known, the path has no area or is shorter than four blocks.
     """
-    edges = arena_edges(recording.truth, bins)
-    samples = box_samples(recording.time, recording.truth, recording.activity, *edges, 1)
+    edges = rate_map.arena_edges(recording.truth, bins)
+    samples = rate_map.box_samples(recording.time, recording.truth, recording.activity, *edges, 1)
     number = ((samples.time - samples.time[0]) // block).astype(int)
     if number[-1] < 3:
         length = samples.time[-1] - samples.time[0]
@@ -108,13 +100,13 @@ def log_posterior(
 
 
 def _decode_half(
-    samples: BoxSamples, train: np.ndarray, edges: Sequence[np.ndarray], seconds: float, smoothing: float
+    samples: rate_map.BoxSamples, train: np.ndarray, edges: Sequence[np.ndarray], seconds: float, sigma: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times [M] s, true and decoded places [M, 2] m of the windows of `seconds` outside `train` [samples]
     bool."""
-    maps = sum_samples(BoxSamples(*(each[train] for each in samples)), *edges, 1)
-    rates = rate_maps(maps, smoothing)
-    test = BoxSamples(*(each[~train] for each in samples))
+    maps = rate_map.sum_samples(rate_map.BoxSamples(*(each[train] for each in samples)), *edges, 1)
+    rates = rate_map.rate_maps(maps, sigma)
+    test = rate_map.BoxSamples(*(each[~train] for each in samples))
     _, window = np.unique((test.time - samples.time[0]) // seconds, return_inverse=True)
     spent = np.bincount(window, test.seconds)
     counts = _sum_windows(window, test.activity * test.seconds[:, None])
@@ -144,7 +136,7 @@ def packet_drift(recording: CellRecording) -> np.ndarray:
         InputError: lengths differ or no pose is known.
     """
     moved = truth_in_sheet(recording)
-    known = np.flatnonzero(known_poses(moved))
+    known = np.flatnonzero(rate_map.known_poses(moved))
     wrapped = recording.packet_pose - moved
     error = np.full(wrapped.shape, np.nan)
     sides = enumerate(recording.torus_sides)
@@ -160,7 +152,7 @@ def truth_in_sheet(recording: CellRecording) -> np.ndarray:
     Raises:
         InputError: lengths differ or no pose is known.
     """
-    check_lengths(recording.time, recording.truth, recording.packet)
-    first = np.flatnonzero(known_poses(recording.truth))[0]
+    rate_map.check_lengths(recording.time, recording.truth, recording.packet)
+    first = np.flatnonzero(rate_map.known_poses(recording.truth))[0]
     truth = np.asarray(recording.truth, np.float64)
     return compose(recording.packet_pose[first], between(truth[first], truth))

@@ -346,15 +346,9 @@ def _annuli(lattice: Lattice, height: int, width: int) -> _Annuli:
     within = np.searchsorted(radius[half], whole, side="right")
     count = np.unique(np.concatenate([below, within, [0]]))
     angles = np.deg2rad(lattice.onto + lattice.between)
-    rotation = [_rotation(angle, y[half], x[half], height, width) for angle in angles]
-    return _Annuli(
-        half=half,
-        rotation=sparse.csr_array(sparse.vstack(rotation)),
-        starts=count[:-1],
-        below=np.searchsorted(count, below),
-        within=np.searchsorted(count, within),
-        bins=count,
-    )
+    rotation = sparse.vstack([_rotation(angle, y[half], x[half], height, width) for angle in angles])
+    below, within = np.searchsorted(count, below), np.searchsorted(count, within)
+    return _Annuli(half, sparse.csr_array(rotation), count[:-1], below, within, count)
 
 
 def _rotation(angle: float, y: np.ndarray, x: np.ndarray, height: int, width: int) -> sparse.csr_array:

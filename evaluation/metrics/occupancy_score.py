@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise, product
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -113,15 +113,6 @@ def grid_error(
         coin=_mean(0.5 * np.abs(true) + 0.5 * np.abs(1 - true)),
         skill=_skill(error, best),
     )
-
-
-def _pool_errors(errors: Sequence[GridError]) -> GridError:
-    """The mean of the errors of several trials, under the same convention."""
-    every = {name: [getattr(one, name) for one in errors] for name in ("error", "prior", "best", "coin")}
-    means = {name: _mean(values) for name, values in every.items()}
-    spread = float(np.std(every["error"], ddof=1)) if len(errors) > 1 else None
-    skill = _skill(means["error"], means["best"])
-    return errors[0].model_copy(update=means | {"spread": spread, "skill": skill})
 
 
 def smooth_truth(values: np.ndarray) -> np.ndarray:
@@ -265,10 +256,16 @@ def score_grid(grid: OccupancyGrid, truth: GridTruth, name: str = "map") -> Grid
 
 def pool_grids(scores: Sequence[GridScore], name: str) -> GridScore:
     """The mean of the scores of single trials (the score of the mean map would hide half the error)."""
-    errors = tuple(_pool_errors(each) for each in zip(*(score.errors for score in scores), strict=True))
+    errors = []
+    for trials in zip(*(score.errors for score in scores), strict=True):  # under the same convention
+        every = {part: [getattr(one, part) for one in trials] for part in ("error", "prior", "best", "coin")}
+        means: dict[str, Any] = {part: _mean(values) for part, values in every.items()}
+        means["spread"] = float(np.std(every["error"], ddof=1)) if len(trials) > 1 else None
+        means["skill"] = _skill(means["error"], means["best"])
+        errors.append(trials[0].model_copy(update=means))
     names = [metric.name for metric in GRID_METRICS]
     quantities = {one: Quantity.pool([score.quantities[one] for score in scores]) for one in names}
-    return GridScore(name=name, trials=len(scores), errors=errors, quantities=quantities)
+    return GridScore(name=name, trials=len(scores), errors=tuple(errors), quantities=quantities)
 
 
 def render_grid_scores(scores: Sequence[GridScore]) -> str:

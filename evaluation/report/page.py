@@ -108,7 +108,7 @@ def write_page(path: Path, runs: Sequence[PageRun], citation: str) -> None:
         style=(_TEMPLATES / "page.css").read_text(encoding="utf-8"),
         scripts=scripts,
         data=embedded_json(data),
-        runs=[_run_context(k, *run, drawn) for k, (run, drawn) in enumerate(zip(runs, charts, strict=True))],
+        runs=[_run_context(k, run, drawn) for k, (run, drawn) in enumerate(zip(runs, charts, strict=True))],
         comparison=[_comparison_row(report) for report in reports] if len(runs) > 1 else None,
         columns=_COLUMNS,
         compared_charts=list(compared),
@@ -131,10 +131,9 @@ def embedded_json(data: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _run_context(
-    number: int, report: RunReport, settings: Sequence[tuple[str, str, str]] | None, charts: dict[str, Any]
-) -> dict[str, Any]:
+def _run_context(number: int, run: PageRun, charts: dict[str, Any]) -> dict[str, Any]:
     """What the template `run.html` shows of a run."""
+    report, settings = run
     return {
         "number": number,
         "report": report,

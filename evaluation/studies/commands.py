@@ -197,10 +197,8 @@ def _cells(arguments: argparse.Namespace) -> int:
 
     study = cell_study(find_config(arguments.config), arguments.set)
     folder = _folder(arguments, study.name, "sets")
-    with (
-        _Progress(study.plan.sets, folder / FOLDER, "set") as progress,
-        Executor(arguments.workers, arguments.scheduler) as executor,
-    ):
+    progress = _Progress(study.plan.sets, folder / FOLDER, "set")
+    with progress, Executor(arguments.workers, arguments.scheduler) as executor:
         scores = run_cell_study(study, folder, executor, progress.count)
     paths = save_cells(study, scores, folder)
     print(render_cells(study, scores))

@@ -364,10 +364,8 @@ def _draw(name: str, rows: Sequence[_GrowthRow]) -> Figure | None:
     for ground, color in zip(grounds, _COLORS, strict=False):
         these = [row.ground == ground for row in timed]
         for values, (statistic, dash, mark) in zip(cost[these].T, _DASHES, strict=True):
-            label = f"{ground}, {statistic}"
-            axes.plot(
-                steps[these], values, dash, color=color, lw=1.5, marker=mark, ms=4.5, mew=0, label=label
-            )
+            text = f"{ground}, {statistic}"
+            axes.plot(steps[these], values, dash, color=color, lw=1.5, marker=mark, ms=4.5, mew=0, label=text)
     style.name_axes(axes, "length of the session (steps)", "processor time of a step (ms), own thread")
     style.add_legend(figure, axes, columns=len(grounds))
     return figure
@@ -385,10 +383,8 @@ def _append_rows(path: Path, task: _GrowthTask) -> str | None:
     from tqdm import tqdm
 
     tqdm.set_lock(RLock())  # the default is a semaphore, which is left over when this process is ended
-    with (
-        tqdm(total=task.lengths[-1], desc=task.ground, unit="step", file=sys.stderr, mininterval=0.5) as bar,
-        path.open("a", encoding="utf-8") as file,
-    ):
+    bar = tqdm(total=task.lengths[-1], desc=task.ground, unit="step", file=sys.stderr, mininterval=0.5)
+    with bar, path.open("a", encoding="utf-8") as file:
         for row in measure_growth(task, bar.update):
             file.write(row.model_dump_json() + "\n")
             file.flush()

@@ -30,13 +30,11 @@ class StudyCourse(NamedTuple):
     """The course of T steps, and what its statistics need.
 
     Attributes:
-        name: of the source. config: of the network. course: input of the networks. expected: [T, 3] poses
-            that the packet would have without drift, cells, not wrapped. bin: [T] flat place bin y * W + x
+        config: of the network. course: input of the networks. expected: [T, 3] poses that the packet would have without drift, cells, not wrapped. bin: [T] flat place bin y * W + x
             of the true position. seconds: [T] duration of each step. x_edges: [W + 1] m. y_edges: [H + 1] m.
             chosen: [C] cells of the flattened network whose rate maps are made.
     """
 
-    name: str
     config: NetworkConfig
     course: CellCourse
     expected: np.ndarray
@@ -94,7 +92,7 @@ def read_course(
     most = network.cells_heading * network.cells_xy**2
     if cells.max() >= most:
         raise InputError("chosen", str(cells.max()), f"indices below {most}, the cells of the network")
-    return StudyCourse(name, network, course, expected, bin, seconds, edges[0], edges[1], cells)
+    return StudyCourse(network, course, expected, bin, seconds, edges[0], edges[1], cells)
 
 
 def _read_session(

@@ -114,14 +114,12 @@ def _row(group: Sequence[RunRecord], odometry: bool = False) -> _Row:
     names |= dict.fromkeys(each for record in fine for each in record.quantities)
     value = RunRecord.odometry if odometry else RunRecord.value
     spreads = {each: spread([value(run, each) for run in fine], each) for each in names}
-    return _Row(
-        row=DEAD_RECKONING if odometry else group[0].row,
-        varied={} if odometry else group[0].varied,
-        runs=len(fine),
-        failed=0 if odometry else len(group) - len(fine),
-        steps=statistics.median([record.steps for record in fine]) if fine else 0.0,
-        spreads={each: found for each, found in spreads.items() if found is not None},
-    )
+    row, varied, failed = group[0].row, group[0].varied, len(group) - len(fine)
+    if odometry:
+        row, varied, failed = DEAD_RECKONING, {}, 0
+    steps = statistics.median([record.steps for record in fine]) if fine else 0.0
+    known = {each: found for each, found in spreads.items() if found is not None}
+    return _Row(row, varied, len(fine), failed, steps, known)
 
 
 _TALL, _EACH, _BOTTOM = 4.4, 0.13, 0.95  # inches: height of the axes, extra per point beyond 12, below
@@ -391,13 +389,9 @@ def save_report(report: _Report, directory: Path) -> list[Path]:
         for name, found in row.spreads.items():
             cells |= {f"{name}_{part}": value for part, value in asdict(found).items() if part != "values"}
         lines.append(cells)
-    files = {
-        "table.csv": csv_text(lines),
-        "table.json": json.dumps(asdict(report), indent=1, allow_nan=False) + "\n",
-        "table.md": f"{render(report)}\n",
-        "pareto.png": figure,
-    }
-    return save_files(directory, files)
+    content, table = json.dumps(asdict(report), indent=1, allow_nan=False), csv_text(lines)
+    files = {"table.csv": table, "table.json": f"{content}\n", "table.md": f"{render(report)}\n"}
+    return save_files(directory, files | {"pareto.png": figure})
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
