@@ -250,11 +250,9 @@ def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[s
 
 def _piece_findings(run: RunArrays, rows: np.ndarray) -> dict[str, Finding]:
     """Findings on a map in several pieces; rows: [K] steps with a true pose."""
-    sizes = np.unique(run.piece, return_counts=True)[1]
-    found = {
-        "pieces": Finding(len(sizes), note=f"{', '.join(map(str, sorted(sizes.tolist())[::-1]))} steps"),
-        "unjoined_share": Finding(unjoined_share(run.piece)),
-    }
+    sizes = sorted(np.unique(run.piece, return_counts=True)[1].tolist(), reverse=True)
+    pieces = Finding(len(sizes), note=f"{', '.join(map(str, sizes))} steps")
+    found = {"pieces": pieces, "unjoined_share": Finding(unjoined_share(run.piece))}
     if run.truth is None or not len(rows):
         return found
     arrays = run.final, run.odometry, run.truth, run.piece

@@ -116,9 +116,8 @@ def read_run_report(directory: Path) -> RunReport:
     name = directory.resolve().name
     scored = (directory / "scorecard.json").exists()
     layers, lines, grid = _layers(directory, run)
-    file, score = directory / "gridscore.json", None
-    if file.exists():
-        score = read_json(file, "the scores of a grid", GridScore.model_validate)
+    file, expected = directory / "gridscore.json", "the scores of a grid"
+    score = read_json(file, expected, GridScore.model_validate) if file.exists() else None
     belief, belief_step = _belief(steps, count)
     cost_step, steps_of, seconds = _columns(directory / "timing.csv", "step", "steps", "seconds")
     online_time, online_error = _columns(directory / "online_error.csv", "t", "error")

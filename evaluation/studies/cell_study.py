@@ -330,15 +330,14 @@ def save_cells(study: _CellStudy, scores: _Scores, folder: Path) -> list[Path]:
     parameters = {f"{each} ({UNITS[each]})".removesuffix(" ()"): columns[each] for each in PARAMETERS}
     drift, decoding, maps = (scores[each] for each in ("drift", "decoding", "maps"))
     chosen = {each: maps[k] for each, k in _chosen(scores).items()}
+    title = f"Decoding error: {name}"
     sets = f"Least, median and most drift of {count} sets; above each map its largest activity"
     files = {
         "table.csv": csv_text(rows),
         "table.md": f"{render_cells(study, scores)}\n",
         "maps.npz": partial(np.savez_compressed, maps=maps, cell=study.course.chosen, **edges),
         "drift.png": _draw_scores(f"Drift: {name}", line, parameters, drift, "drift, rms (m)"),
-        "decoding.png": _draw_scores(
-            f"Decoding error: {name}", line, parameters, decoding, "decoding error (m)"
-        ),
+        "decoding.png": _draw_scores(title, line, parameters, decoding, "decoding error (m)"),
         "maps.png": _draw_rate_maps(f"Rate maps by drift: {name}", sets, chosen, **edges),
     }
     return save_files(folder, files)

@@ -116,14 +116,10 @@ def machine() -> Machine:
     """This machine."""
     import jax
 
-    device = jax.devices()[0]
-    return Machine(
-        processor=processor_name(),
-        device="cpu" if device.platform == "cpu" else device.device_kind,
-        versions={name: version(name) for name in ("jax", "jaxlib", "numpy")}
-        | {"python": platform.python_version()},
-        build=code_digest(),
-    )
+    device, libraries = jax.devices()[0], ("jax", "jaxlib", "numpy")
+    kind = "cpu" if device.platform == "cpu" else device.device_kind
+    versions = {name: version(name) for name in libraries} | {"python": platform.python_version()}
+    return Machine(processor=processor_name(), device=kind, versions=versions, build=code_digest())
 
 
 def watch_machine() -> Callable[[], tuple[float, Machine]]:

@@ -95,10 +95,9 @@ def _content(
             return _tiers(config, seconds)
     rows = dict(CHOICES)
     if config.recording is None:
-        rows |= {
-            f"grid, {count}": {"backend": "grid", "grid.particles": count, "session.precision": "float32"}
-            for count in PARTICLES
-        }
+        for count in PARTICLES:
+            grid = {"backend": "grid", "grid.particles": count, "session.precision": "float32"}
+            rows[f"grid, {count}"] = grid
     if config.simulation is not None:
         rows["quasistatic"] = {"simulation.fidelity": "quasistatic"}
     return {"rows": rows, "seeds": 3, "pace": "live", "report": "pareto"}, []

@@ -30,9 +30,10 @@ class StudyCourse(NamedTuple):
     """The course of T steps, and what its statistics need.
 
     Attributes:
-        config: of the network. course: input of the networks. expected: [T, 3] poses that the packet would have without drift, cells, not wrapped. bin: [T] flat place bin y * W + x
-            of the true position. seconds: [T] duration of each step. x_edges: [W + 1] m. y_edges: [H + 1] m.
-            chosen: [C] cells of the flattened network whose rate maps are made.
+        config: of the network. course: input of the networks. expected: [T, 3] poses that the packet would
+            have without drift, cells, not wrapped. bin: [T] flat place bin y * W + x of the true position.
+            seconds: [T] duration of each step. x_edges: [W + 1] m. y_edges: [H + 1] m. chosen: [C] cells of
+            the flattened network whose rate maps are made.
     """
 
     config: NetworkConfig
@@ -74,10 +75,8 @@ def read_course(
     noise = stream(seed, "cells.noise").standard_normal((len(expected), 2))
     noise[:, 1] *= np.sqrt(seconds)
     newest = np.maximum.accumulate(np.r_[-1, template])
-    course = CellCourse(
-        motion, noise, np.maximum(template, 0), template > newest[:-1],
-        relative / units(network, np.dtype(float))[2], energy,
-    )  # fmt: skip
+    novel, turned = template > newest[:-1], relative / units(network, np.dtype(float))[2]
+    course = CellCourse(motion, noise, np.maximum(template, 0), novel, turned, energy)
     # Flat bins in the smallest square round the path.
     low, high = truth[:, :2].min(axis=0), truth[:, :2].max(axis=0)
     side, middle = (high - low).max(), (low + high) / 2
