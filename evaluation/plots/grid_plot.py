@@ -134,6 +134,7 @@ def _paint(axes: style.Axes, panel: GridPanel, *, errors: bool = False) -> None:
 
 def _paint_key(figure: style.Figure, left: float, bottom: float, tall: float) -> None:
     """Draws the grey scale of occupancy right of a map, in inches."""
-    bar = style.add_scale(figure, (left + 0.2, bottom, _BAR, tall), "gray", 1.0, "occupancy", 9)
+    box, shades = (left + 0.2, bottom, _BAR, tall), np.linspace(0, 1, 256)[:, None]
+    bar = style.add_scale(figure, box, shades, 1.0, "occupancy", 9)
     bar.set_yticks([0, 0.3, 0.5, 1.0])
     bar.tick_params(labelsize=7.5)

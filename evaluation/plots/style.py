@@ -5,6 +5,7 @@ matplotlib is imported on first use and without pyplot: no window, no global sta
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -79,12 +80,12 @@ def add_dial(figure: Figure, left: float, bottom: float, side: float) -> Axes:
 
 
 def add_scale(
-    figure: Figure, box: tuple[float, float, float, float], colors: str, top: float, title: str, pad: float
+    figure: Figure, box: Sequence[float], shades: np.ndarray, top: float, title: str, pad: float
 ) -> Axes:
-    """A bar of the colours of a map from 0 to `top`, with ticks at its right, at a position in inches."""
+    """A bar of greys [N, 1] or colours [N, 1, 3] from 0 to `top`, with ticks at its right, at a position in
+    inches."""
     bar = add_axes(figure, *box)
-    shades = np.linspace(0, 1, 256)[:, None]
-    bar.imshow(shades, cmap=colors, vmin=0, vmax=1, extent=(0, 1, 0, top), origin="lower", aspect="auto")
+    bar.imshow(shades, cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, top), origin="lower", aspect="auto")
     bar.set_xticks([])
     bar.yaxis.tick_right()
     bar.set_title(title, fontsize=8, color=LABEL_GREY, loc="left", pad=pad)

@@ -25,7 +25,6 @@ _ROW, _GAP, _MARKS, _BOTTOM, _KEY = 0.062, 0.5, 0.22, 0.62, 1.25  # inches
 _FLATTEST, _TALLEST = 0.35, 1.3
 _REACH = 0.078  # radius of a drawn head, m; fits between the walls of a maze cell
 _LARGEST, _LEAST = 0.08, 0.045  # limits of the radius as shares of the scene
-_COLORS = "viridis_r"  # of heights, as shares of the tallest
 _HOLE = 0.28  # share of the radius without whiskers
 
 
@@ -41,7 +40,6 @@ def draw_whiskers(
     Raises:
         InputError: the numbers of images and steps differ.
     """
-    from matplotlib import colormaps
     from matplotlib.colors import to_rgb
 
     if len(images.view) != len(run.time):
@@ -73,7 +71,7 @@ def draw_whiskers(
     line = f"{len(images.view)} whisks  ·  {heads}  ·  {touched:.0%} of whiskers in contact"
     figure = style.new_figure(total, card.name, line)
 
-    pixels, bottom = colormaps[_COLORS](images.view)[..., :3], total - style.TOP - _MARKS + _GAP
+    pixels, bottom = _colors(images.view), total - style.TOP - _MARKS + _GAP
     pixels[images.view == 0] = to_rgb(_NOTHING)
     pixels[~images.alive] = to_rgb(_DEAD)
     for part in parts:
@@ -110,6 +108,13 @@ def _spread(pose: np.ndarray, steps: np.ndarray, apart: float) -> np.ndarray:
         chosen.append(int(away.argmax()))
         away = np.minimum(away, np.hypot(*(place - place[chosen[-1]]).T))
     return np.sort(steps[chosen])
+
+
+def _colors(share: np.ndarray) -> np.ndarray:
+    """The colours [..., 3] of heights, given as shares [...] of the tallest."""
+    import matplotlib
+
+    return matplotlib.colormaps["viridis_r"](share)[..., :3]
 
 
 def _paint_strip(
@@ -176,7 +181,8 @@ def _paint_key(figure: style.Figure, images: WhiskerViews, left: float, high: fl
 
     tall = max(0.5, min(1.6, high - size - 1.0))
     box = left + 0.35, top - size - 0.35 - tall, 0.16, tall
-    style.add_scale(figure, box, _COLORS, 1000 * images.tallest, "height (mm)", 8)
+    ramp = _colors(np.linspace(0, 1, 256))[:, None]
+    style.add_scale(figure, box, ramp, 1000 * images.tallest, "height (mm)", 8)
     across, up = figure.get_size_inches()
     handles = [Patch(facecolor=_NOTHING, edgecolor=LABEL_GREY, lw=0.4, label="no contact")]
     if not images.alive.all():

@@ -44,9 +44,9 @@ def run_charts(report: RunReport) -> dict[str, Any]:
         charts["spread"] = _figure([spread], "time, s", "m", zero=True)
     if len(report.belief):
         kinds = (("heaviest packet", "final"), ("second packet", "doubted"), ("new place", "odometry"))
-        at, shares = time[report.belief_step], zip(kinds, report.belief.T, strict=True)
         traces = [
-            _line(np.column_stack([at, share]), name, role, width=1.2) for (name, role), share in shares
+            _line(np.column_stack([time[report.belief_step], share]), name, role, width=1.2)
+            for (name, role), share in zip(kinds, report.belief.T, strict=True)
         ]
         charts["belief"] = _figure(traces, "time, s", "probability")
         charts["belief"].update_yaxes(range=[-0.02, 1.02])
