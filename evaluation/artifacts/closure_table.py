@@ -130,11 +130,9 @@ class ChangeRow(NamedTuple):
     def describe(self) -> str:
         """The place in one line."""
         what = {"new": "something new", "gone": "something gone"}.get(self.kind, "something different")
-        return (
-            f"changed: {what} at ({self.x:.2f}, {self.y:.2f}) m, {self.extent:.2f} m long, "
-            f"{self.passes} passes, steps {self.first_step} to {self.last_step}, "
-            f"evidence {self.evidence:.0f} nat"
-        )
+        where = f"({self.x:.2f}, {self.y:.2f}) m, {self.extent:.2f} m long"
+        when = f"{self.passes} passes, steps {self.first_step} to {self.last_step}"
+        return f"changed: {what} at {where}, {when}, evidence {self.evidence:.0f} nat"
 
 
 def write_changes(path: Path, changes: Sequence[ChangeRow]) -> None:

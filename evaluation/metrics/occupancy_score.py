@@ -273,10 +273,8 @@ def render_grid_scores(scores: Sequence[GridScore]) -> str:
     width = max(len("mapper"), *(len(score.name) for score in scores))
     trials = ", ".join(str(n) for n in sorted({score.trials for score in scores}))
     head = f"{'outside':<9}{'cells':<7}{'truth':<10}{'mapper':<{width + 2}}{'paper':>6}{'ours':>8}{'sd':>8}"
-    lines = [
-        f"Map error, eq. 6: mean |map - truth| per cell; trials: {trials}",
-        head + f"{'constant 0.3':>14}{'best constant':>15}{'skill':>8}",
-    ]
+    title = f"Map error, eq. 6: mean |map - truth| per cell; trials: {trials}"
+    lines = [title, head + f"{'constant 0.3':>14}{'best constant':>15}{'skill':>8}"]
     for convention in DISTINCT_CONVENTIONS:
         outside, cells, truth = convention.words
         label = f"{outside:<9}{cells:<7}{truth:<10}"
@@ -290,11 +288,9 @@ def render_grid_scores(scores: Sequence[GridScore]) -> str:
             label = " " * len(label)
         lines += [label + order for order in _order(scores, convention)] + [""]
     coin = scores[0].errors[0].coin
-    lines += [
-        f"A random map (fair coin per cell) has error {coin:.3f} for any truth (0.47 in the paper).",
-        "",
-        " " * 36 + "".join(f"{score.name:>{max(width, 7) + 2}}" for score in scores),
-    ]
+    random = f"A random map (fair coin per cell) has error {coin:.3f} for any truth (0.47 in the paper)."
+    names = "".join(f"{score.name:>{max(width, 7) + 2}}" for score in scores)
+    lines += [random, "", " " * 36 + names]
     for metric in GRID_METRICS:
         values = (_text(score.quantities[metric.name].value) for score in scores)
         cells = "".join(f"{value:>{max(width, 7) + 2}}" for value in values)

@@ -91,11 +91,9 @@ class Scene(NamedTuple):
     def describe(self) -> str:
         """The statistics as a sentence."""
         pace = f" at {self.rate:.3g} Hz, {self.usual * self.rate:.3g} m/s" if self.rate else ""
-        return (
-            f"{self.name}: {self.cycles} cycles{pace}; odometry spans {self.span[0]:.3g} x "
-            f"{self.span[1]:.3g} m, {self.usual:.2g} m a cycle (95 %: {self.most:.2g}), turns up to "
-            f"{self.turn:.2g} rad (95 %)"
-        )
+        moves = f"{self.usual:.2g} m a cycle (95 %: {self.most:.2g}), turns up to {self.turn:.2g} rad (95 %)"
+        spans = f"{self.span[0]:.3g} x {self.span[1]:.3g} m"
+        return f"{self.name}: {self.cycles} cycles{pace}; odometry spans {spans}, {moves}"
 
 
 def scene_of(source: Source) -> Scene:

@@ -270,10 +270,9 @@ def _jobs(study: Study) -> Iterator[Job]:
     total = copies * prod(map(len, plan.vary.values())) * len(plan.every_seed())
     if total > MOST:
         raise InputError(study.document.at_key(()), f"{total} jobs", f"at most {MOST}", "vary less at a time")
-    alternatives: list[list[_Setting]] = [
-        [(key, value, ("vary", key, k)) for k, value in enumerate(values)]
-        for key, values in plan.vary.items()
-    ]
+    alternatives: list[list[_Setting]] = []
+    for key, values in plan.vary.items():
+        alternatives.append([(key, value, ("vary", key, k)) for k, value in enumerate(values)])
     wrong: dict[str, InputError] = {}
     for name, row in rows.items():
         keys = _outermost_first(row.settings)
