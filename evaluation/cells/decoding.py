@@ -3,7 +3,6 @@ the activity packet, its decoded pose minus the true pose over time (Burak & Fie
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,9 @@ from evaluation.cells.recording import CellRecording
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose
+
+
+_Edges = tuple[np.ndarray, np.ndarray]
 
 
 class Decoding(NamedTuple):
@@ -100,7 +102,7 @@ def log_posterior(
 
 
 def _decode_half(
-    samples: rate_map.BoxSamples, train: np.ndarray, edges: Sequence[np.ndarray], seconds: float, sigma: float
+    samples: rate_map.BoxSamples, train: np.ndarray, edges: _Edges, seconds: float, sigma: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times [M] s, true and decoded places [M, 2] m of the windows of `seconds` outside `train` [samples]
     bool."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -325,7 +325,8 @@ def save_cells(study: _CellStudy, scores: _Scores, folder: Path) -> list[Path]:
     """Writes table.csv with all sets, table.md, maps.npz with all rate maps, and the pictures drift.png,
     decoding.png and maps.png."""
     columns, line, name = _columns(study, scores), _describe(study), study.name
-    count, edges = len(scores["drift"]), {"x_edges": study.course.x_edges, "y_edges": study.course.y_edges}
+    edges: dict[str, Any] = {"x_edges": study.course.x_edges, "y_edges": study.course.y_edges}
+    count = len(scores["drift"])
     rows = [{"set": k, **{each: float(column[k]) for each, column in columns.items()}} for k in range(count)]
     parameters = {f"{each} ({UNITS[each]})".removesuffix(" ()"): columns[each] for each in PARAMETERS}
     drift, decoding, maps = (scores[each] for each in ("drift", "decoding", "maps"))

@@ -168,10 +168,9 @@ def _tier(config: RunConfig) -> Iterator[_Recommendation]:
     if simulation is None:
         return
     tier, reason = choose_tier(simulation.model_copy(update={"fidelity": "auto"}))
-    why = f"{reason}; `study --preset tiers` compares them"
-    if simulation.fidelity == "auto":
-        tier, why = "auto", f"{tier}: {why}"
-    yield _of(config, "simulation.fidelity", tier, why)
+    auto = simulation.fidelity == "auto"
+    why = f"{tier}: " * auto + f"{reason}; `study --preset tiers` compares them"
+    yield _of(config, "simulation.fidelity", "auto" if auto else tier, why)
 
 
 def _parts(cells: float) -> int:
