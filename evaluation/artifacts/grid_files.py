@@ -40,7 +40,8 @@ def read_grid(path: str | Path) -> OccupancyGrid:
 def write_grid_truth(path: str | Path, truth: GridTruth, start: np.ndarray) -> None:
     """Writes the truth in the frame of the map, and `start` [3]: the pose of that frame (where the robot
     started) in the frame of the true poses."""
-    np.savez_compressed(path, **truth._asdict(), start=start)
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, **truth._asdict(), start=start)
 
 
 def read_grid_truth(path: str | Path) -> tuple[GridTruth, np.ndarray]:

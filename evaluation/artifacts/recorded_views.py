@@ -35,7 +35,8 @@ def eight_bit(view: np.ndarray) -> np.ndarray:
 
 def write_closure_views(path: Path, views: ClosureViews) -> None:
     """Writes the file; equal views give equal bytes."""
-    np.savez_compressed(path, **views._asdict())
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, step=views.step, view=views.view)
 
 
 def read_closure_views(directory: Path) -> ClosureViews | None:
@@ -80,7 +81,8 @@ def write_whisker_views(path: str | Path, images: WhiskerViews) -> None:
     arrays = {name: np.asarray(array) for name, array in images._asdict().items()}
     # Rounded up, so that a whisker in contact is never 0.
     arrays["view"] = np.ceil(_WHITE * images.view).astype(np.uint8)
-    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
 def read_whisker_views(path: str | Path) -> WhiskerViews:

@@ -13,7 +13,6 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose
 
-
 _Edges = tuple[np.ndarray, np.ndarray]
 
 

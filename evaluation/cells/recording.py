@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,7 +84,12 @@ def write_recording(path: str | Path, recording: CellRecording) -> None:
     sums = recording.sums or BinnedSums(*(np.zeros(0) for _ in BinnedSums._fields))
     arrays: dict[str, Any] = {name: value for name, value in recording._asdict().items() if name != "sums"}
     arrays |= {_SUMS + name: value for name, value in sums._asdict().items()}
-    write_atomically(Path(path), partial(np.savez_compressed, format=np.array(FORMAT), **arrays))
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, format=np.array(FORMAT), **arrays)
+
+    write_atomically(Path(path), write)
 
 
 def read_recording(path: str | Path) -> CellRecording:
