@@ -158,7 +158,8 @@ def test_the_page_has_a_table_and_a_picture_per_row(maps: Path, tmp_path: Path) 
     assert "31000" in page
     sessions = read_sessions(tmp_path / "maps.csv")
     assert list(sessions) == [(name, "31000") for name in names]
-    assert sessions["start", "31000"].figures["whisks"] == 11
+    _, figures = sessions["start", "31000"]
+    assert figures["whisks"] == 11
 
 
 def failures(name: str, methods: Methods, maps: Path) -> list[str]:

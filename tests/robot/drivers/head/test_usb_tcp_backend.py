@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from robot.drivers.head.decoder import Decoder, Frames
+from robot.drivers.head.driver_config import PORT
 from robot.drivers.head.emulated_cable import SocketBackend
 from robot.drivers.head.usb_protocol import (
     ENDPOINT_IN,
@@ -52,7 +53,7 @@ def head(process: Faults) -> Faults:
 
 
 def find_device(head: Faults) -> Any:
-    return core.find(backend=SocketBackend(head.host), idVendor=VENDOR, idProduct=PRODUCT)
+    return core.find(backend=SocketBackend(head.host, PORT), idVendor=VENDOR, idProduct=PRODUCT)
 
 
 @pytest.fixture
@@ -97,7 +98,7 @@ def test_the_device_is_found_with_its_descriptors(head: Faults, device: Any) -> 
     (interface,) = device.get_active_configuration()
     assert [end.bEndpointAddress for end in interface] == [ENDPOINT_IN, ENDPOINT_OUT]
     assert util.endpoint_type(interface[0].bmAttributes) == util.ENDPOINT_TYPE_BULK
-    assert core.find(backend=SocketBackend(head.host), idVendor=0x1234) is None
+    assert core.find(backend=SocketBackend(head.host, PORT), idVendor=0x1234) is None
     assert find_device(Faults(head.process, "127.0.0.1", 0)) is None or head.host == "127.0.0.1"
 
 
