@@ -9,7 +9,8 @@ from __future__ import annotations
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from math import atan2
 from pathlib import Path
 from typing import NamedTuple
@@ -57,7 +58,7 @@ class RunProgress(NamedTuple):
     sd: np.ndarray
     odometry: np.ndarray
     truth: np.ndarray
-    outcomes: Mapping[str, int]
+    outcomes: Counter[str]
     lost: int
     online_error: float | None
     checkpoint: int
@@ -82,9 +83,7 @@ class RunProgress(NamedTuple):
         parts = [f"{self.name}: {self.status}", self.step_count, f"{self.length:.1f} m"]
         parts += [] if pace is None else [f"{pace:.0f} steps/s"]
         parts += [] if self.online_error is None else [f"error {self.online_error:.3g} m"]
-        parts += [
-            f"{count} {name}" for name, count in sorted(self.outcomes.items(), key=lambda item: -item[1])
-        ]
+        parts += [f"{count} {name}" for name, count in self.outcomes.most_common()]
         parts += [f"{self.lost} lost"] if self.lost else []
         parts += [f"map_doubted ({self.doubt:.0%})"] if (self.doubt or 0.0) > DOUBTED else []
         parts += [f"input warned ({len(self.warnings)})"] if self.warnings else []
@@ -183,10 +182,8 @@ class RunMonitor:
         """Time of the last write to these files, s; 0 without any."""
         dates = [0.0]
         for name in names:
-            try:
+            with suppress(OSError):  # not written yet, or just renamed
                 dates.append((self.directory / name).stat().st_mtime)
-            except OSError:
-                continue  # not written yet, or just renamed
         return max(dates)
 
 
@@ -346,8 +343,7 @@ def _paint(axes: style.Axes, seen: RunProgress, walls: np.ndarray) -> None:
 
 def _paint_counts(figure: style.Figure, seen: RunProgress, left: float) -> None:
     """Number of steps by outcome, right of the map."""
-    counts = sorted(seen.outcomes.items(), key=lambda item: -item[1])
-    counts += [("lost", seen.lost)] if seen.lost else []
+    counts = seen.outcomes.most_common() + [("lost", seen.lost)] * bool(seen.lost)
     steps = max(1, len(seen.path))
     for row, (name, count) in enumerate(counts):
         low = _BOTTOM + _TALL - 0.45 * (row + 1)

@@ -50,21 +50,16 @@ def read_closure_table(directory: Path) -> ClosureTable:
     file = directory / "closures.csv"
     if not file.exists():
         return ClosureTable(np.zeros((0, 2), int), [], {})
-    expected = "the columns step, match_step, verdict, and numbers in all others"
-    rows = read_rows(
-        file,
-        expected,
-        lambda row: (
-            [int(np.int32(row[name])) for name in ("match_step", "step")],
-            str(row["verdict"]),
-            {name: float(row[name]) for name in row if name not in KEYS},
-        ),
-    )
-    names = list(rows[0][2]) if rows else []
-    steps, verdicts, evidence = zip(*rows, strict=True) if rows else ((), (), ())
-    columns = np.array([list(cells.values()) for cells in evidence], float).reshape(len(rows), len(names)).T
-    counted = np.array(steps, int).reshape(-1, 2) - first_step(directory)
-    return ClosureTable(counted, list(verdicts), dict(zip(names, columns, strict=True)))
+
+    def parse(row: Mapping[str, str]) -> tuple[list[int], str, dict[str, float]]:
+        pair = [int(np.int32(row[name])) for name in ("match_step", "step")]
+        return pair, str(row["verdict"]), {name: float(row[name]) for name in row if name not in KEYS}
+
+    rows = read_rows(file, "the columns step, match_step, verdict, and numbers in all others", parse)
+    names = rows[0][2] if rows else {}
+    evidence = {name: np.array([cells[name] for _, _, cells in rows]) for name in names}
+    steps = np.array([pair for pair, _, _ in rows], int).reshape(-1, 2) - first_step(directory)
+    return ClosureTable(steps, [verdict for _, verdict, _ in rows], evidence)
 
 
 def read_closures(directory: Path) -> np.ndarray:
@@ -99,9 +94,8 @@ def count_closures(path: Path) -> Closures | None:
     table = read_closure_table(path)
     accepted = table.accepted()
     sequence = table.evidence.get("sequence", np.arange(len(accepted)))
-    return Closures(
-        len(accepted), int(accepted.sum()), len(np.unique(sequence)), len(np.unique(sequence[accepted]))
-    )
+    sequences = len(np.unique(sequence)), len(np.unique(sequence[accepted]))
+    return Closures(len(accepted), int(accepted.sum()), *sequences)
 
 
 CHANGES = "changes.csv"
@@ -126,30 +120,25 @@ class ChangeRow(NamedTuple):
     @classmethod
     def parse(cls, line: Mapping[str, str]) -> ChangeRow:
         """The place of a line of the file; a ValueError for a line that is malformed."""
-        x, y, extent, evidence, alarms = (
-            float(line[name]) for name in ("x", "y", "extent", "evidence", "alarms")
-        )
-        if not np.isfinite([x, y, extent, evidence, alarms]).all():
+        numbers = [float(line[name]) for name in ("x", "y", "extent", "evidence", "alarms")]
+        if not np.isfinite(numbers).all():
             raise ValueError("a number that is not finite")
+        x, y, extent, evidence, alarms = numbers
         passes, first, last = (int(np.int32(line[name])) for name in ("passes", "first_step", "last_step"))
         return cls(x, y, extent, str(line["kind"]), evidence, alarms, passes, first, last)
 
     def describe(self) -> str:
         """The place in one line."""
         what = {"new": "something new", "gone": "something gone"}.get(self.kind, "something different")
-        return (
-            f"changed: {what} at ({self.x:.2f}, {self.y:.2f}) m, {self.extent:.2f} m long, "
-            f"{self.passes} passes, steps {self.first_step} to {self.last_step}, "
-            f"evidence {self.evidence:.0f} nat"
-        )
+        where = f"({self.x:.2f}, {self.y:.2f}) m, {self.extent:.2f} m long"
+        when = f"{self.passes} passes, steps {self.first_step} to {self.last_step}"
+        return f"changed: {what} at {where}, {when}, evidence {self.evidence:.0f} nat"
 
 
 def write_changes(path: Path, changes: Sequence[ChangeRow]) -> None:
     """Writes the places, the surest first."""
     with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows(changes)
+        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *changes])
 
 
 def read_changes(path: Path) -> list[ChangeRow]:

@@ -68,9 +68,7 @@ def read_session_steps(folder: Path) -> list[int]:
         InputError: merge.json is missing or malformed.
     """
     expected = f"the {MERGE_REPORT} of a merged map"
-    return read_json(
-        folder / MERGE_REPORT, expected, lambda content: [int(count) for count in content["steps"]]
-    )
+    return read_json(folder / MERGE_REPORT, expected, lambda content: list(map(int, content["steps"])))
 
 
 def check_run_directory(path: Path) -> None:

@@ -14,14 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evaluation.cells import head_direction
 from evaluation.cells.fields import border_score, find_fields
-from evaluation.cells.head_direction import (
-    mean_vector_length,
-    peak_rate,
-    preferred_direction,
-    rayleigh_p,
-    rayleigh_z,
-)
 from evaluation.cells.information import information, information_rate, mean_rate, selectivity, sparsity
 from evaluation.cells.rate_map import coherence, rate_maps, recorded_sums, tuning_curves
 from evaluation.cells.recording import CellRecording
@@ -86,7 +80,7 @@ def analyse_cells(recording: CellRecording, gain: float | None = None) -> CellSc
         sheet_y=row * recording.cell_size,
         sheet_heading=heading * 2 * np.pi / recording.shape[0],
         mean_rate=mean_rate(*place),
-        peak_rate=peak_rate(*place),
+        peak_rate=head_direction.peak_rate(*place),
         information=about_place,
         information_rate=information_rate(*place),
         sparsity=sparsity(*place),
@@ -95,11 +89,11 @@ def analyse_cells(recording: CellRecording, gain: float | None = None) -> CellSc
         fields=fields.number,
         field_area=fields.largest * bin_area,
         border=border_score(*place),
-        vector_length=mean_vector_length(*turn),
-        direction=preferred_direction(*turn),
-        heading_peak=peak_rate(*turn),
-        rayleigh_z=rayleigh_z(*turn),
-        rayleigh_p=rayleigh_p(*turn),
+        vector_length=head_direction.mean_vector_length(*turn),
+        direction=head_direction.preferred_direction(*turn),
+        heading_peak=head_direction.peak_rate(*turn),
+        rayleigh_z=head_direction.rayleigh_z(*turn),
+        rayleigh_p=head_direction.rayleigh_p(*turn),
         heading_information=about_heading,
         conjunctive=np.minimum(about_place, about_heading),
     )
@@ -111,8 +105,7 @@ def write_scores(path: Path, scores: CellScores) -> None:
 
     def write(temporary: Path) -> None:
         with temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(CellScores._fields)
-            writer.writerows(zip(*(column.tolist() for column in scores), strict=True))
+            rows = zip(*(column.tolist() for column in scores), strict=True)
+            csv.writer(file, lineterminator="\n").writerows([CellScores._fields, *rows])
 
     write_atomically(path, write)

@@ -7,19 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.cells.rate_map import (
-    BoxSamples,
-    arena_edges,
-    box_samples,
-    check_lengths,
-    known_poses,
-    rate_maps,
-    sum_samples,
-)
+from evaluation.cells import rate_map
 from evaluation.cells.recording import CellRecording
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose
+
+_Edges = tuple[np.ndarray, np.ndarray]
 
 
 class Decoding(NamedTuple):
@@ -64,13 +58,12 @@ def decode_positions(
     Raises:
         InputError: lengths differ, no pose is known, the path has no area or is shorter than four blocks.
     """
-    edges = arena_edges(recording.truth, bins)
-    samples = box_samples(recording.time, recording.truth, recording.activity, *edges, 1)
+    edges = rate_map.arena_edges(recording.truth, bins)
+    samples = rate_map.box_samples(recording.time, recording.truth, recording.activity, *edges, 1)
     number = ((samples.time - samples.time[0]) // block).astype(int)
     if number[-1] < 3:
-        raise InputError(
-            "recording", f"{samples.time[-1] - samples.time[0]:.1f} s", f"four blocks of {block} s"
-        )
+        length = samples.time[-1] - samples.time[0]
+        raise InputError("recording", f"{length:.1f} s", f"four blocks of {block} s")
     halves = [_decode_half(samples, number % 2 == half, edges, window, smoothing) for half in (0, 1)]
     time, truth, decoded = (np.concatenate(parts) for parts in zip(*halves, strict=True))
     order = np.argsort(time, kind="stable")
@@ -108,24 +101,18 @@ def log_posterior(
 
 
 def _decode_half(
-    samples: BoxSamples,
-    train: np.ndarray,
-    edges: tuple[np.ndarray, np.ndarray],
-    seconds: float,
-    smoothing: float,
+    samples: rate_map.BoxSamples, train: np.ndarray, edges: _Edges, seconds: float, sigma: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times [M] s, true and decoded places [M, 2] m of the windows of `seconds` outside `train` [samples]
     bool."""
-    maps = sum_samples(BoxSamples(*(each[train] for each in samples)), *edges, 1)
-    rates = rate_maps(maps, smoothing)
-    test = BoxSamples(*(each[~train] for each in samples))
+    maps = rate_map.sum_samples(rate_map.BoxSamples(*(each[train] for each in samples)), *edges, 1)
+    rates = rate_map.rate_maps(maps, sigma)
+    test = rate_map.BoxSamples(*(each[~train] for each in samples))
     _, window = np.unique((test.time - samples.time[0]) // seconds, return_inverse=True)
     spent = np.bincount(window, test.seconds)
     counts = _sum_windows(window, test.activity * test.seconds[:, None])
-    time, truth = (
-        _sum_windows(window, each) / np.bincount(window)[:, None]
-        for each in (test.time[:, None], test.position)
-    )
+    size = np.bincount(window)[:, None]
+    time, truth = (_sum_windows(window, each) / size for each in (test.time[:, None], test.position))
     posterior = log_posterior(counts, spent, rates, np.zeros(rates.shape[1:]))
     row, column = np.divmod(posterior.reshape(len(counts), -1).argmax(axis=1), rates.shape[2])
     x, y = ((each[1:] + each[:-1]) / 2 for each in edges)
@@ -150,12 +137,11 @@ def packet_drift(recording: CellRecording) -> np.ndarray:
         InputError: lengths differ or no pose is known.
     """
     moved = truth_in_sheet(recording)
-    known = np.flatnonzero(known_poses(moved))
+    known = np.flatnonzero(rate_map.known_poses(moved))
     wrapped = recording.packet_pose - moved
     error = np.full(wrapped.shape, np.nan)
-    error[known] = np.stack(
-        [np.unwrap(wrapped[known, i], period=side) for i, side in enumerate(recording.torus_sides)], axis=1
-    )
+    sides = enumerate(recording.torus_sides)
+    error[known] = np.stack([np.unwrap(wrapped[known, i], period=side) for i, side in sides], axis=1)
     error[known] -= error[known[0]]
     return error
 
@@ -167,7 +153,7 @@ def truth_in_sheet(recording: CellRecording) -> np.ndarray:
     Raises:
         InputError: lengths differ or no pose is known.
     """
-    check_lengths(recording.time, recording.truth, recording.packet)
-    first = np.flatnonzero(known_poses(recording.truth))[0]
+    rate_map.check_lengths(recording.time, recording.truth, recording.packet)
+    first = np.flatnonzero(rate_map.known_poses(recording.truth))[0]
     truth = np.asarray(recording.truth, np.float64)
     return compose(recording.packet_pose[first], between(truth[first], truth))

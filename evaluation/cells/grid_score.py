@@ -48,9 +48,8 @@ def autocorrelogram(rates: np.ndarray) -> np.ndarray:
     rates = np.asarray(rates, float)
     if rates.ndim != 3 or 0 in rates.shape[1:]:
         raise InputError("rates", f"array of shape {list(rates.shape)}", "maps [n, H, W] with bins")
-    reach = [
-        (int(np.round(side + side * _OVERLAP)) - 1) // 2 for side in rates.shape[1:]
-    ]  # largest kept lags
+    # The largest kept lags.
+    reach = [(int(np.round(side + side * _OVERLAP)) - 1) // 2 for side in rates.shape[1:]]
     maps = np.empty((len(rates), 2 * reach[0] + 1, 2 * reach[1] + 1))
     for start in range(0, len(rates), _MAPS_AT_ONCE):
         batch = slice(start, start + _MAPS_AT_ONCE)
@@ -259,9 +258,8 @@ def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -
     """
     maps = np.asarray(autocorrelograms, float)
     if maps.ndim != 3 or any(side % 2 == 0 for side in maps.shape[1:]):
-        raise InputError(
-            "autocorrelograms", f"array of shape {list(maps.shape)}", "maps [n, h, w] with odd sides"
-        )
+        found = f"array of shape {list(maps.shape)}"
+        raise InputError("autocorrelograms", found, "maps [n, h, w] with odd sides")
     batches = [maps[i : i + _SCORED_AT_ONCE] for i in range(0, len(maps), _SCORED_AT_ONCE)]
     return np.concatenate([_score_batch(batch, lattice) for batch in batches] or [np.empty(0)])
 
@@ -348,15 +346,9 @@ def _annuli(lattice: Lattice, height: int, width: int) -> _Annuli:
     within = np.searchsorted(radius[half], whole, side="right")
     count = np.unique(np.concatenate([below, within, [0]]))
     angles = np.deg2rad(lattice.onto + lattice.between)
-    rotation = [_rotation(angle, y[half], x[half], height, width) for angle in angles]
-    return _Annuli(
-        half=half,
-        rotation=sparse.csr_array(sparse.vstack(rotation)),
-        starts=count[:-1],
-        below=np.searchsorted(count, below),
-        within=np.searchsorted(count, within),
-        bins=count,
-    )
+    rotation = sparse.vstack([_rotation(angle, y[half], x[half], height, width) for angle in angles])
+    below, within = np.searchsorted(count, below), np.searchsorted(count, within)
+    return _Annuli(half, sparse.csr_array(rotation), count[:-1], below, within, count)
 
 
 def _rotation(angle: float, y: np.ndarray, x: np.ndarray, height: int, width: int) -> sparse.csr_array:
@@ -442,6 +434,5 @@ def _place_peak(image: np.ndarray, row: int, column: int) -> complex:
         curvature = before - 2 * peak + after
         return 0.5 * (before - after) / curvature if curvature < 0 else 0.0
 
-    return complex(
-        column + shift(*image[row, column - 1 : column + 2]), row + shift(*image[row - 1 : row + 2, column])
-    )
+    across, up = shift(*image[row, column - 1 : column + 2]), shift(*image[row - 1 : row + 2, column])
+    return complex(column + across, row + up)

@@ -20,13 +20,13 @@ def information(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     `information_above_mean`.
     """
     relative, share = _relative(rates, seconds)
-    return _total(share * xlogy(relative, relative)) / np.log(2)
+    return (share * xlogy(relative, relative)).sum(axis=1) / np.log(2)
 
 
 def information_above_mean(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """[n] `information`, summed over the bins above the mean rate alone; the convention of opexebo."""
     relative, share = _relative(rates, seconds)
-    return _total(share * xlogy(relative, np.maximum(relative, 1.0))) / np.log(2)
+    return (share * xlogy(relative, np.maximum(relative, 1.0))).sum(axis=1) / np.log(2)
 
 
 def information_rate(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
@@ -41,7 +41,7 @@ def sparsity(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     Skaggs et al. 1996.
     """
     relative, share = _relative(rates, seconds)
-    return 1 / _total(share * relative**2)
+    return 1 / (share * relative**2).sum(axis=1)
 
 
 def selectivity(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
@@ -53,18 +53,14 @@ def selectivity(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
 def mean_rate(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """[n] sum p r, in the unit of the rates."""
     rates, share = weigh_bins(rates, seconds)
-    return _total(share * rates)
+    return (share * rates).sum(axis=1)
 
 
 def _relative(rates: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rates over their mean [n, bins], NaN for a cell without activity, and the share of time [n, bins]."""
     rates, share = weigh_bins(rates, seconds)
-    mean = _total(share * rates)
+    mean = (share * rates).sum(axis=1)
     return rates / np.where(mean > 0, mean, np.nan)[:, None], share
-
-
-def _total(values: np.ndarray) -> np.ndarray:
-    return values.sum(axis=1)
 
 
 def conjunctive_information(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:

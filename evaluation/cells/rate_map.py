@@ -29,9 +29,8 @@ def rate_maps(sums: BinnedSums, smoothing: float = 1.5, least_seconds: float = 0
         InputError: the sums do not fit each other, or no bin was visited long enough.
     """
     if sums.place.shape[1:] != sums.seconds.shape:
-        raise InputError(
-            "sums.place", f"bins {sums.place.shape[1:]}", f"the bins of sums.seconds, {sums.seconds.shape}"
-        )
+        expected = f"the bins of sums.seconds, {sums.seconds.shape}"
+        raise InputError("sums.place", f"bins {sums.place.shape[1:]}", expected)
     visited = _visited(sums.seconds, least_seconds)
     rates = smooth_plane(sums.place, smoothing)
     rates *= np.where(visited, 1 / np.where(visited, smooth_plane(sums.seconds, smoothing), 1.0), np.nan)
@@ -157,14 +156,8 @@ def box_samples(
     inside = np.flatnonzero((place >= 0) & (heading >= 0))
     if not seconds[inside].sum() > 0:
         raise InputError("truth", "no time is spent in any bin", "a path inside the edges", "check the edges")
-    return BoxSamples(
-        np.asarray(time)[inside],
-        seconds[inside],
-        truth[inside, :2],
-        place[inside],
-        heading[inside],
-        activity[inside],
-    )
+    series = np.asarray(time), seconds, truth[:, :2], place, heading, activity
+    return BoxSamples(*(each[inside] for each in series))
 
 
 def sum_samples(
@@ -297,12 +290,8 @@ def _interval(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
 def _visited(seconds: np.ndarray, least_seconds: float) -> np.ndarray:
     visited = seconds >= least_seconds
     if not visited.any():
-        raise InputError(
-            "sums",
-            f"no bin with {least_seconds} s of time",
-            "a visited arena",
-            "check edges and least_seconds",
-        )
+        found, cure = f"no bin with {least_seconds} s of time", "check edges and least_seconds"
+        raise InputError("sums", found, "a visited arena", cure)
     return visited
 
 

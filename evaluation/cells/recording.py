@@ -101,9 +101,8 @@ def read_recording(path: str | Path) -> CellRecording:
     own = [name for name in CellRecording._fields if name != "sums"]
     names = ["format", *own, *(_SUMS + name for name in BinnedSums._fields)]
 
-    def parse(
-        kind: np.ndarray, shape: np.ndarray, cell_size: np.ndarray, *arrays: np.ndarray
-    ) -> CellRecording:
+    def parse(*found: np.ndarray) -> CellRecording:
+        kind, shape, cell_size, *arrays = found
         if kind.shape or str(kind) != FORMAT:
             raise ValueError(f"the format {str(kind)[:40]!r}")
         sums = BinnedSums(*arrays[len(own) - 2 :])

@@ -9,15 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from evaluation.cells import rate_map
 from evaluation.cells.decoding import truth_in_sheet
-from evaluation.cells.rate_map import (
-    check_lengths,
-    circle_bin,
-    known_poses,
-    sample_seconds,
-    sum_into,
-    weigh_bins,
-)
 from evaluation.cells.recording import CellRecording
 from tactile.base.se2 import wrap
 
@@ -39,15 +32,13 @@ def folded_maps(recording: CellRecording, bins: int = 21) -> tuple[np.ndarray, n
     Raises:
         InputError: lengths differ or no pose is known.
     """
-    check_lengths(recording.time, recording.activity)
+    rate_map.check_lengths(recording.time, recording.activity)
     path = truth_in_sheet(recording)
-    known = known_poses(path)
-    width, height, _ = recording.torus_sides
-    column, row = (
-        circle_bin(2 * np.pi * path[known, i] / side, bins) for i, side in enumerate((width, height))
-    )
-    spent = sample_seconds(recording.time)[known]
-    seconds, sums = sum_into(row * bins + column, spent, recording.activity[known], (bins, bins))
+    known = rate_map.known_poses(path)
+    angles = (2 * np.pi * path[known, i] / side for i, side in enumerate(recording.torus_sides[:2]))
+    column, row = (rate_map.circle_bin(angle, bins) for angle in angles)
+    spent = rate_map.sample_seconds(recording.time)[known]
+    seconds, sums = rate_map.sum_into(row * bins + column, spent, recording.activity[known], (bins, bins))
     return sums / np.where(seconds > 0, seconds, np.nan), seconds
 
 
@@ -57,7 +48,7 @@ def map_phases(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
 
     Biased for a cell whose field lies partly where the rat was not: let the path cover the torus.
     """
-    filled, _ = weigh_bins(rates, seconds)
+    filled, _ = rate_map.weigh_bins(rates, seconds)
     bins = rates.shape[-1]
     plane, unit = filled.reshape(rates.shape), np.exp(2j * np.pi * np.arange(bins) / bins)
     vector = np.stack([plane.sum(axis=1) @ unit, plane.sum(axis=2) @ unit], axis=1)

@@ -116,12 +116,9 @@ def shuffled_scores(
     samples, seconds = len(bins.flat), float(np.sum(bins.seconds))
     shortest = int(np.ceil(SHORTEST_SHIFT * samples / seconds))
     if samples <= 2 * shortest:
-        raise InputError(
-            "bins.seconds",
-            f"a path of {seconds:g} s",
-            f"more than {2 * SHORTEST_SHIFT:g} s",
-            f"record longer: a shuffle shifts by at least {SHORTEST_SHIFT:g} s either way",
-        )
+        found, expected = f"a path of {seconds:g} s", f"more than {2 * SHORTEST_SHIFT:g} s"
+        cure = f"record longer: a shuffle shifts by at least {SHORTEST_SHIFT:g} s either way"
+        raise InputError("bins.seconds", found, expected, cure)
     shape = shuffles, activity.shape[1]
     shifts = stream(seed, "cell shuffles").integers(shortest, samples - shortest + 1, shape)
     return _score_shifts(activity, bins, score, shifts)
@@ -192,11 +189,8 @@ def _check_path(activity: np.ndarray, bins: PathBins) -> None:
     size = math.prod(bins.shape)
     unknown = ~((bins.flat >= -1) & (bins.flat < size) & np.isfinite(bins.seconds))
     if unknown.any():
-        raise InputError(
-            "bins",
-            f"NaN or no such bin in {unknown.sum()} samples of the path, first in sample {unknown.argmax()}",
-            f"-1 .. {size - 1}",
-            "leave out samples of unknown pose, or give them bin -1",
-        )
+        samples = f"in {unknown.sum()} samples of the path, first in sample {unknown.argmax()}"
+        cure = "leave out samples of unknown pose, or give them bin -1"
+        raise InputError("bins", f"NaN or no such bin {samples}", f"-1 .. {size - 1}", cure)
     if not bins.seconds[bins.flat >= 0].sum() > 0:
         raise InputError("bins", "no time in any bin", "a path in the arena", "check the edges")

@@ -51,12 +51,6 @@ class Relations(NamedTuple):
     motion: np.ndarray
 
 
-def successive_pairs(count: int, step: int = 1) -> np.ndarray:
-    """The pairs (i, i + step) of `count` rows: [P, 2]."""
-    i = np.arange(max(0, count - step))
-    return np.stack([i, i + step], axis=1)
-
-
 def energy(estimate: np.ndarray, truth: np.ndarray, pairs: np.ndarray) -> Energy:
     """Energy over the given pairs.
 

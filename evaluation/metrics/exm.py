@@ -30,13 +30,9 @@ _COLUMNS = {
     "experience": ("id", "experience id", "experience_id", "exp", "place"),
     "x": ("true_x", "gt_x", "truth_x"),
     "y": ("true_y", "gt_y", "truth_y"),
-    "theta": (
-        "th",
-        "heading",
-        "yaw",
-        *(f"{prefix}_{th}" for prefix in ("true", "gt", "truth") for th in ("th", "theta")),
-    ),
-}
+    "theta": ("th", "heading", "yaw", "true_th", "true_theta", "gt_th", "gt_theta", "truth_th",
+              "truth_theta"),
+}  # fmt: skip
 
 
 def read_experience_log(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise, product
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -111,21 +111,6 @@ def grid_error(
         prior=_mean(np.abs(PRIOR_OCCUPANCY - true)),
         best=best,
         coin=_mean(0.5 * np.abs(true) + 0.5 * np.abs(1 - true)),
-        skill=_skill(error, best),
-    )
-
-
-def _pool_errors(errors: Sequence[GridError]) -> GridError:
-    """The mean of the errors of several trials, under the same convention."""
-    every = [error.error for error in errors]
-    error, best = _mean(every), _mean([each.best for each in errors])
-    return GridError(
-        convention=errors[0].convention,
-        error=error,
-        spread=float(np.std(every, ddof=1)) if len(every) > 1 else None,
-        prior=_mean([each.prior for each in errors]),
-        best=best,
-        coin=_mean([each.coin for each in errors]),
         skill=_skill(error, best),
     )
 
@@ -264,24 +249,23 @@ def score_grid(grid: OccupancyGrid, truth: GridTruth, name: str = "map") -> Grid
     grid.check(truth)
     surface = touchable_surface(grid, truth)
     findings = _cells(grid, surface) | _chamfer(grid, truth, surface)
-    return GridScore(
-        name=name,
-        errors=tuple(grid_error(grid, truth, surface, convention) for convention in CONVENTIONS),
-        quantities={metric.name: metric.quantity(findings[metric.name]) for metric in GRID_METRICS},
-    )
+    errors = tuple(grid_error(grid, truth, surface, convention) for convention in CONVENTIONS)
+    quantities = {metric.name: metric.quantity(findings[metric.name]) for metric in GRID_METRICS}
+    return GridScore(name=name, errors=errors, quantities=quantities)
 
 
 def pool_grids(scores: Sequence[GridScore], name: str) -> GridScore:
     """The mean of the scores of single trials (the score of the mean map would hide half the error)."""
-    return GridScore(
-        name=name,
-        trials=len(scores),
-        errors=tuple(_pool_errors(each) for each in zip(*(score.errors for score in scores), strict=True)),
-        quantities={
-            metric.name: Quantity.pool([score.quantities[metric.name] for score in scores])
-            for metric in GRID_METRICS
-        },
-    )
+    errors = []
+    for trials in zip(*(score.errors for score in scores), strict=True):  # under the same convention
+        every = {part: [getattr(one, part) for one in trials] for part in ("error", "prior", "best", "coin")}
+        means: dict[str, Any] = {part: _mean(values) for part, values in every.items()}
+        means["spread"] = float(np.std(every["error"], ddof=1)) if len(trials) > 1 else None
+        means["skill"] = _skill(means["error"], means["best"])
+        errors.append(trials[0].model_copy(update=means))
+    names = [metric.name for metric in GRID_METRICS]
+    quantities = {one: Quantity.pool([score.quantities[one] for score in scores]) for one in names}
+    return GridScore(name=name, trials=len(scores), errors=tuple(errors), quantities=quantities)
 
 
 def render_grid_scores(scores: Sequence[GridScore]) -> str:
@@ -289,10 +273,8 @@ def render_grid_scores(scores: Sequence[GridScore]) -> str:
     width = max(len("mapper"), *(len(score.name) for score in scores))
     trials = ", ".join(str(n) for n in sorted({score.trials for score in scores}))
     head = f"{'outside':<9}{'cells':<7}{'truth':<10}{'mapper':<{width + 2}}{'paper':>6}{'ours':>8}{'sd':>8}"
-    lines = [
-        f"Map error, eq. 6: mean |map - truth| per cell; trials: {trials}",
-        head + f"{'constant 0.3':>14}{'best constant':>15}{'skill':>8}",
-    ]
+    title = f"Map error, eq. 6: mean |map - truth| per cell; trials: {trials}"
+    lines = [title, head + f"{'constant 0.3':>14}{'best constant':>15}{'skill':>8}"]
     for convention in DISTINCT_CONVENTIONS:
         outside, cells, truth = convention.words
         label = f"{outside:<9}{cells:<7}{truth:<10}"
@@ -306,11 +288,9 @@ def render_grid_scores(scores: Sequence[GridScore]) -> str:
             label = " " * len(label)
         lines += [label + order for order in _order(scores, convention)] + [""]
     coin = scores[0].errors[0].coin
-    lines += [
-        f"A random map (fair coin per cell) has error {coin:.3f} for any truth (0.47 in the paper).",
-        "",
-        " " * 36 + "".join(f"{score.name:>{max(width, 7) + 2}}" for score in scores),
-    ]
+    random = f"A random map (fair coin per cell) has error {coin:.3f} for any truth (0.47 in the paper)."
+    names = "".join(f"{score.name:>{max(width, 7) + 2}}" for score in scores)
+    lines += [random, "", " " * 36 + names]
     for metric in GRID_METRICS:
         values = (_text(score.quantities[metric.name].value) for score in scores)
         cells = "".join(f"{value:>{max(width, 7) + 2}}" for value in values)

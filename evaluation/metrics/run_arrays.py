@@ -95,13 +95,9 @@ class RunArrays(NamedTuple):
     def check(self) -> None:
         """Raises `InputError` if an array has a wrong shape, an unknown value or an index out of range."""
         steps, nodes = len(self.time), len(self.nodes)
-        shapes: dict[str, tuple[int, ...]] = {
-            **dict.fromkeys(("time", "experience"), (steps,)),
-            **dict.fromkeys(("online", "final", "odometry"), (steps, 3)),
-            "created": (nodes,),
-            "nodes": (nodes, 3),
-            "links": (len(self.links), 2),
-        }
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("time", "experience"), (steps,))
+        shapes |= dict.fromkeys(("online", "final", "odometry"), (steps, 3))
+        shapes |= {"created": (nodes,), "nodes": (nodes, 3), "links": (len(self.links), 2)}
         if self.truth is not None:
             shapes["truth"] = (steps, 3)
         for name, shape in shapes.items():

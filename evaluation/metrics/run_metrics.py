@@ -12,14 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.energy_metric import (
-    Energy,
-    Relations,
-    energy,
-    energy_all_pairs,
-    relation_errors,
-    successive_pairs,
-)
+from evaluation.metrics.energy_metric import Energy, Relations, energy, energy_all_pairs, relation_errors
 from evaluation.metrics.exm import EXM_MODES, ExmConfig, base_end, change_rows, experience_metric
 from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
 from evaluation.metrics.run_arrays import RunArrays
@@ -30,6 +23,7 @@ from evaluation.metrics.trajectory import (
     position_error,
     position_errors,
     rpe,
+    successive_pairs,
     summarize_errors,
 )
 from tactile.base.errors import InputError
@@ -256,22 +250,17 @@ def _trajectories(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[s
 
 def _piece_findings(run: RunArrays, rows: np.ndarray) -> dict[str, Finding]:
     """Findings on a map in several pieces; rows: [K] steps with a true pose."""
-    sizes = np.unique(run.piece, return_counts=True)[1]
-    found = {
-        "pieces": Finding(len(sizes), note=f"{', '.join(map(str, sorted(sizes.tolist())[::-1]))} steps"),
-        "unjoined_share": Finding(unjoined_share(run.piece)),
-    }
+    sizes = sorted(np.unique(run.piece, return_counts=True)[1].tolist(), reverse=True)
+    pieces = Finding(len(sizes), note=f"{', '.join(map(str, sizes))} steps")
+    found = {"pieces": pieces, "unjoined_share": Finding(unjoined_share(run.piece))}
     if run.truth is None or not len(rows):
         return found
-    final, odometry, true, piece = (
-        values[rows] for values in (run.final, run.odometry, run.truth, run.piece)
-    )
+    arrays = run.final, run.odometry, run.truth, run.piece
+    final, odometry, true, piece = (values[rows] for values in arrays)
     ours, raw = (energy_within_pieces(poses, true, piece) for poses in (final, odometry))
     error, raw_error = (ate_within_pieces(poses, true, piece) for poses in (final, odometry))
-    return found | {
-        "energy_within_pieces": Finding(ours.total, raw.total, f"{ours.pairs} pairs"),
-        "ate_within_pieces": Finding(error, raw_error, "each piece aligned by itself"),
-    }
+    found["energy_within_pieces"] = Finding(ours.total, raw.total, f"{ours.pairs} pairs")
+    return found | {"ate_within_pieces": Finding(error, raw_error, "each piece aligned by itself")}
 
 
 def _energies(run: RunArrays, truth: np.ndarray, rows: np.ndarray, gap: int) -> dict[str, Finding]:
@@ -347,7 +336,6 @@ def anchored_errors(run: RunArrays) -> dict[str, Finding]:
         return {}
     # All backends take the first step from odometry, so its error is not theirs.
     start = compose(truth[0], inverse(run.odometry[0]))
-    online, final, odometry = (
-        position_error(compose(start, path), truth) for path in (run.online, run.final, run.odometry)
-    )
+    paths = run.online, run.final, run.odometry
+    online, final, odometry = (position_error(compose(start, path), truth) for path in paths)
     return {"error_online": Finding(online, odometry), "error_final": Finding(final, odometry)}

@@ -35,15 +35,13 @@ def read_text_table(path: str | Path, columns: Columns) -> tuple[np.ndarray, np.
     fields = _cells(lines[0][1])
     header = _numbers(fields) is None
     names = [name.lower() for name in fields] if header else list(columns)
-    found = [
-        [names.index(name) for name in (column, *others) if name in names]
-        for column, others in columns.items()
-    ]
+    known = {column: (column, *others) for column, others in columns.items()}
+    found = [[names.index(name) for name in each if name in names] for each in known.values()]
     missing = [column for column, at in zip(columns, found, strict=True) if not at]
     if missing:
-        known = "; ".join("/".join((column, *columns[column])) for column in missing)
         lack = f"no column {', '.join(missing)} among {' '.join(names)}"
-        raise InputError(f"{path}:{lines[0][0]}", lack, known)
+        wanted = "; ".join("/".join(known[column]) for column in missing)
+        raise InputError(f"{path}:{lines[0][0]}", lack, wanted)
     rows, at = [], []
     for number, line in lines[header:]:
         cells = _cells(line)

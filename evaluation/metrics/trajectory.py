@@ -45,6 +45,12 @@ def ate(estimate: np.ndarray, reference: np.ndarray) -> float:
     return _rms(position_errors(estimate, reference))
 
 
+def successive_pairs(count: int, step: int = 1) -> np.ndarray:
+    """The pairs (i, i + step) of `count` rows: [P, 2]."""
+    i = np.arange(max(0, count - step))
+    return np.stack([i, i + step], axis=1)
+
+
 def motion_errors(estimate: np.ndarray, reference: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Error of the estimated motion between two rows, delta_ij (-) delta*_ij: [P, 3], m, m, rad.
 
@@ -60,8 +66,7 @@ def motion_errors(estimate: np.ndarray, reference: np.ndarray, pairs: np.ndarray
 def rpe(estimate: np.ndarray, reference: np.ndarray, step: int = 1) -> tuple[float, float]:
     """Relative pose error over `step` rows (Sturm et al. 2012): root mean squares of translation, m, and
     rotation, rad; NaN with fewer rows."""
-    i = np.arange(max(0, len(estimate) - step))
-    error = motion_errors(estimate, reference, np.stack([i, i + step], axis=1))
+    error = motion_errors(estimate, reference, successive_pairs(len(estimate), step))
     return _rms(np.hypot(error[:, 0], error[:, 1])), _rms(error[:, 2])
 
 

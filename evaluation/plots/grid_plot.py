@@ -98,8 +98,6 @@ def _aspect(grid: OccupancyGrid) -> float:
 
 def _paint(axes: style.Axes, panel: GridPanel, *, errors: bool = False) -> None:
     """Draws the map, the walls and the paths in the order of the legend, which has their `errors`."""
-    from matplotlib.collections import LineCollection
-
     grid, (height, width) = panel.grid, panel.grid.probability.shape
     left, bottom = (float(value) for value in grid.origin)
     right, top = left + width * grid.cell, bottom + height * grid.cell
@@ -112,8 +110,8 @@ def _paint(axes: style.Axes, panel: GridPanel, *, errors: bool = False) -> None:
     axes.grid(visible=False)
     axes.tick_params(axis="x", pad=6)  # clear of the lowest tick label of the other axis
     if len(panel.segments):
-        walls = list(panel.segments.reshape(-1, 2, 2))
-        axes.add_collection(LineCollection(walls, colors=VERMILLION, lw=1.0, zorder=2, label="true walls"))
+        walls = panel.segments.reshape(-1, 2, 2)
+        style.add_lines(axes, walls, VERMILLION, lw=1.0, zorder=2, label="true walls")
     if panel.paths is None:
         return
     truth, estimate, odometry = (np.asarray(path)[:, :2] for path in panel.paths)
@@ -134,11 +132,7 @@ def _paint(axes: style.Axes, panel: GridPanel, *, errors: bool = False) -> None:
 
 def _paint_key(figure: style.Figure, left: float, bottom: float, tall: float) -> None:
     """Draws the grey scale of occupancy right of a map, in inches."""
-    bar = style.add_axes(figure, left + 0.2, bottom, _BAR, tall)
-    shades = np.linspace(0, 1, 256)[:, None]
-    bar.imshow(shades, cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1), origin="lower", aspect="auto")
-    bar.set_xticks([])
+    box, shades = (left + 0.2, bottom, _BAR, tall), np.linspace(0, 1, 256)[:, None]
+    bar = style.add_scale(figure, box, shades, 1.0, "occupancy", 9)
     bar.set_yticks([0, 0.3, 0.5, 1.0])
-    bar.yaxis.tick_right()
     bar.tick_params(labelsize=7.5)
-    bar.set_title("occupancy", fontsize=8, color=LABEL_GREY, loc="left", pad=9)

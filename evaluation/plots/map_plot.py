@@ -153,8 +153,6 @@ def _xy(pose: np.ndarray) -> np.ndarray:
 
 def _paint(axes: style.Axes, run: RunArrays, layers: Layers) -> None:
     """Draws the layers in the order of the legend; `zorder` sets which layer is in front."""
-    from matplotlib.collections import LineCollection
-
     crowd = min(1.0, np.sqrt(150 / max(1, len(layers.nodes))))  # thinner strokes for many experiences
     truth, odometry, final, nodes, _ = layers
     if truth is not None:
@@ -170,13 +168,11 @@ def _paint(axes: style.Axes, run: RunArrays, layers: Layers) -> None:
         (run.links[older], VERMILLION, "link to an older experience"),
     ):
         if len(links):
-            axes.add_collection(LineCollection(nodes[links], colors=color, lw=lw, zorder=3, label=label))
+            style.add_lines(axes, nodes[links], color, lw=lw, zorder=3, label=label)
 
 
 def _paint_laps(axes: style.Axes, run: RunArrays, layers: Layers, apart: float, pairs: np.ndarray) -> None:
     """Draws a run in a maze; a closure is wrong if its places are more than `apart` m apart in truth."""
-    from matplotlib.collections import LineCollection
-
     truth, odometry, final, nodes, _ = layers
     assert truth is not None
     line = split_at_jumps(truth, truth)
@@ -186,8 +182,7 @@ def _paint_laps(axes: style.Axes, run: RunArrays, layers: Layers, apart: float, 
     own = (run.created[run.links] >= 0).all(axis=1)
     if not own.all():
         name = "map" if len(run.state) else "map before"
-        lines = LineCollection(nodes[run.links[~own]], colors=INK, lw=2.2, alpha=0.35, zorder=1.5, label=name)
-        axes.add_collection(lines)
+        style.add_lines(axes, nodes[run.links[~own]], INK, lw=2.2, alpha=0.35, zorder=1.5, label=name)
     joined, place = (pairs, final) if len(pairs) else (run.links[own & _older(run.links)], nodes)
     steps = joined if len(pairs) else run.created[joined]
     with np.errstate(invalid="ignore"):
@@ -197,8 +192,7 @@ def _paint_laps(axes: style.Axes, run: RunArrays, layers: Layers, apart: float, 
         (wrong, VERMILLION, 2, f"false loop closure (over {apart:g} m)"),
     ):
         if some.any():
-            lines = place[joined[some]]
-            axes.add_collection(LineCollection(lines, colors=color, lw=0.7, zorder=over, label=name))
+            style.add_lines(axes, place[joined[some]], color, lw=0.7, zorder=over, label=name)
 
 
 def _paint_path(
@@ -331,11 +325,9 @@ def draw_sessions(title: str, path: np.ndarray, piece: np.ndarray, steps: Sequen
     for number, (count, end) in enumerate(zip(steps, ends, strict=True)):
         own = slice(end - count, end)
         parted = np.flatnonzero(np.diff(piece[own])) + 1  # no line from one piece to the next
-        drawn = np.insert(shown[own], parted, np.nan, axis=0)
-        colour = PIECES[min(number, NAMED)]
-        axes.plot(
-            *drawn.T, color=colour, lw=0.9, alpha=0.8, zorder=3, label=f"map {number + 1}, {count} steps"
-        )
+        drawn, colour = np.insert(shown[own], parted, np.nan, axis=0), PIECES[min(number, NAMED)]
+        label = f"map {number + 1}, {count} steps"
+        axes.plot(*drawn.T, color=colour, lw=0.9, alpha=0.8, zorder=3, label=label)
         label = "start" if number == 0 else "_"
         axes.plot(*shown[end - count], "o", ms=8, mfc="none", mec=GREEN, mew=1.6, zorder=4, label=label)
     return style.add_legend(figure, axes)
@@ -350,16 +342,12 @@ def draw_way(
         line: subtitle. nodes: [N, 2] experiences, m. links: [L, 2] their indices. way: [K, 3] poses of the
             way, K >= 1 (m, m, rad). felt: [n, 2] contacts in the map, m; may be empty.
     """
-    from matplotlib.collections import LineCollection
-
     box = style.frame(np.concatenate([nodes, felt, way[:, :2]]))
     figure, axes = style.map_figure(box, title, line, style.MAP)
     if len(felt):
         axes.plot(*felt.T, ".", color=GREY, ms=2.2, mew=0, zorder=1, label="contact felt")
     if len(links):
-        axes.add_collection(
-            LineCollection(list(nodes[links]), colors=BLUE, lw=0.7, alpha=0.55, zorder=2, label="link")
-        )
+        style.add_lines(axes, nodes[links], BLUE, lw=0.7, alpha=0.55, zorder=2, label="link")
     axes.plot(*nodes.T, "o", color=BLUE, ms=2.4, mew=0, zorder=3, label="experience")
     axes.plot(*way[:, :2].T, color=VERMILLION, lw=3.2, solid_capstyle="round", zorder=4, label="way")
     axes.plot(*way[0, :2], "o", ms=9, mfc="white", mec=GREEN, mew=2.2, ls="none", zorder=5, label="start")

@@ -51,9 +51,8 @@ def run_plots(directory: Path) -> dict[str, Callable[[], Figure]]:
         plots["grid"] = lambda: draw_grid(_grid_panel(directory, run))
     cells = directory / recording.NAME
     if cells.exists():
-        plots["cells"] = lambda: draw_recorded_cells(
-            f"Pose cells: {card.name}", recording.read_recording(cells)
-        )
+        title = f"Pose cells: {card.name}"
+        plots["cells"] = lambda: draw_recorded_cells(title, recording.read_recording(cells))
     return plots
 
 

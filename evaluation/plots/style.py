@@ -5,12 +5,14 @@ matplotlib is imported on first use and without pyplot: no window, no global sta
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, distinguishable with common forms of colour blindness
@@ -77,26 +79,50 @@ def add_dial(figure: Figure, left: float, bottom: float, side: float) -> Axes:
     return axes
 
 
+def add_scale(
+    figure: Figure, box: Sequence[float], shades: np.ndarray, top: float, title: str, pad: float
+) -> Axes:
+    """A bar of greys [N, 1] or colours [N, 1, 3] from 0 to `top`, with ticks at its right, at a position in
+    inches."""
+    bar = add_axes(figure, *box)
+    bar.imshow(shades, cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, top), origin="lower", aspect="auto")
+    bar.set_xticks([])
+    bar.yaxis.tick_right()
+    bar.set_title(title, fontsize=8, color=LABEL_GREY, loc="left", pad=pad)
+    return bar
+
+
 def name_axes(axes: Axes, across: str, up: str) -> None:
     """Sets the axis labels, with units."""
     axes.set_xlabel(across, color=LABEL_GREY, fontsize=9)
     axes.set_ylabel(up, color=LABEL_GREY, fontsize=9)
 
 
+def add_lines(axes: Axes, lines: np.ndarray, color: str, **how: Any) -> None:
+    """Draws straight lines [n, 2, 2] of one colour."""
+    from matplotlib.collections import LineCollection
+
+    axes.add_collection(LineCollection(list(lines), colors=color, **how))
+
+
 def log_axes(axes: Axes, across: np.ndarray, up: np.ndarray) -> None:
     """Sets logarithmic axes around positive values of any shapes, with round tick labels and a light grid."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-
     axes.set(xscale="log", yscale="log")
     for axis, limit, values in ((axes.xaxis, axes.set_xlim, across), (axes.yaxis, axes.set_ylim, up)):
         low, high = np.log(values.min()), np.log(values.max())
         room = ROOM * max(high - low, np.log(2.0)) / (1 - 2 * ROOM)
         limit(np.exp(low - room), np.exp(high + room))
-        steps = (1, 2, 5) if high - low < np.log(300) else (1,)
-        axis.set_major_locator(LogLocator(subs=steps, numticks=30))
-        axis.set_minor_locator(NullLocator())
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
+        log_ticks(axis, (1, 2, 5) if high - low < np.log(300) else (1,))
     axes.grid(color=LINE_GREY, lw=0.7)
+
+
+def log_ticks(axis: Axis, steps: tuple[int, ...]) -> None:
+    """Sets plain tick labels on a logarithmic axis, at these multiples of powers of ten."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    axis.set_major_locator(LogLocator(subs=steps, numticks=30))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
 
 
 def frame(points: np.ndarray) -> np.ndarray:

@@ -152,8 +152,7 @@ def _paint_head(
     centre, middle = (float(pose[0]), float(pose[1])), np.degrees(pose[2] + azimuth)
     wedges = [
         Wedge(centre, hole + (ring + 1) * thick, middle[column] - half, middle[column] + half, width=thick)
-        for ring in range(rings)
-        for column in range(columns)
+        for ring, column in np.ndindex(rings, columns)
     ]
     face = pixels.reshape(-1, 3)
     axes.add_patch(Circle(centre, reach, facecolor="white", edgecolor=GREY, lw=0.7, zorder=2.9))
@@ -181,16 +180,9 @@ def _paint_key(figure: style.Figure, images: WhiskerViews, left: float, high: fl
         axes.text(0, -out, f"{1000 * length:.0f}", size=6.5, color=INK, ha="center", va="center", zorder=5)
 
     tall = max(0.5, min(1.6, high - size - 1.0))
-    bar = style.add_axes(figure, left + 0.35, top - size - 0.35 - tall, 0.16, tall)
-    bar.imshow(
-        _colors(np.linspace(0, 1, 256))[:, None],
-        extent=(0, 1, 0, 1000 * images.tallest),
-        origin="lower",
-        aspect="auto",
-    )
-    bar.set_xticks([])
-    bar.yaxis.tick_right()
-    bar.set_title("height (mm)", fontsize=8, color=LABEL_GREY, loc="left", pad=8)
+    box = left + 0.35, top - size - 0.35 - tall, 0.16, tall
+    ramp = _colors(np.linspace(0, 1, 256))[:, None]
+    style.add_scale(figure, box, ramp, 1000 * images.tallest, "height (mm)", 8)
     across, up = figure.get_size_inches()
     handles = [Patch(facecolor=_NOTHING, edgecolor=LABEL_GREY, lw=0.4, label="no contact")]
     if not images.alive.all():

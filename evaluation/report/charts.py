@@ -60,15 +60,12 @@ def run_charts(report: RunReport) -> dict[str, Any]:
 
 def _map_chart(report: RunReport) -> Any:
     """The map: walls or grid, truth, odometry, final trajectory, experiences with their links, closures."""
-    from plotly import graph_objects
-
     layers, traces = report.layers, []
     corners = wall_corners(report.walls, layers.to_map)
     if report.grid is not None:
         traces.append(_grid_trace(report.grid))
     if len(report.walls):
-        x, y = _columns(_gapped(corners))
-        wall = graph_objects.Scatter(x=x, y=y, fill="toself", mode="lines", line_width=0)
+        wall = _scatter(_gapped(corners), fill="toself", mode="lines", line_width=0)
         traces.append(wall.update(name="wall", meta="wall", hoverinfo="skip"))
     if len(report.truth_lines):
         lines = _gapped(report.truth_lines.reshape(-1, 2, 2))
@@ -103,10 +100,7 @@ def overlay_chart(reports: Sequence[RunReport]) -> Any:
     known = [_as_true(each, each.layers.truth) for each in reports if each.layers.truth is not None][:1]
     paths = [_as_true(report, report.layers.final) for report in reports]
     traces = [_line(split_at_jumps(truth, truth), "truth", "truth", width=5) for truth in known]
-    traces += [
-        _line(path, report.name, *_run_style(k))
-        for k, (path, report) in enumerate(zip(paths, reports, strict=True))
-    ]
+    traces += [_line(path, reports[k].name, *_run_style(k)) for k, path in enumerate(paths)]
     box = np.stack(bounds(*paths, *known))
     return _map_figure(traces, box, "the truth, or of the map,")
 
@@ -140,33 +134,27 @@ def error_chart(reports: Sequence[RunReport]) -> Any | None:
 
 
 def _place_traces(report: RunReport) -> list[Any]:
-    from plotly import graph_objects
-
     nodes = report.layers.nodes
     if not len(nodes):
         return []
-    x, y = _columns(nodes)
     size = _MARK * min(1.0, np.sqrt(_CROWD / len(nodes))) * 0.75
     marker = {"size": size, "symbol": "circle", "maxdisplayed": _DRAWN}
     hover, name = "experience %{pointNumber}<extra></extra>", "experience, with links"
-    places = graph_objects.Scatter(x=x, y=y, mode="markers", name=name, meta="place", marker=marker)
+    places = _scatter(nodes, mode="markers", name=name, meta="place", marker=marker)
     return [places.update(hovertemplate=hover, legendgroup="experience")]
 
 
 def _closure_traces(report: RunReport) -> list[Any]:
     """Of each verdict the marks halfway between the two places; a mark carries the closure's number."""
-    from plotly import graph_objects
-
     traces, table = [], report.closures
     size = max(4.0, _MARK * min(1.0, np.sqrt(_CROWD / max(1, len(table.steps)))))
     for verdict, rows, ends in _drawn_closures(report):
         role, symbol, _ = _CLOSURES.get(verdict, _OTHER)
-        x, y = _columns(ends.mean(axis=1))
         name = f"closure, {_text(WORDS.get(verdict, verdict))} ({len(rows):,})"
         mark = {"size": size, "symbol": symbol, "line": {"width": 1}, "maxdisplayed": _DRAWN}
         mark["opacity"] = 0.35 if role == "refused" else 1
         text = [f"steps {earlier} and {later}" for earlier, later in table.steps[rows].tolist()]
-        trace = graph_objects.Scatter(x=x, y=y, mode="markers", name=name, meta=role, marker=mark, text=text)
+        trace = _scatter(ends.mean(axis=1), mode="markers", name=name, meta=role, marker=mark, text=text)
         trace.update(customdata=rows.astype(np.int32), hovertemplate="%{text}<extra></extra>")
         traces.append(trace.update(legendgroup=_text(verdict)))
     return traces
@@ -208,13 +196,16 @@ def _line(
     points: np.ndarray, name: str, role: str, dash: str = "solid", width: float = 1, opacity: float = 1
 ):
     """A line through points [n, 2]; NaN rows interrupt it."""
+    how = {"mode": "lines", "line": {"width": width, "dash": dash}, "hoverinfo": "skip"}
+    return _scatter(points, name=_text(name), meta=role, opacity=opacity, **how)
+
+
+def _scatter(points: np.ndarray, **how: Any) -> Any:
+    """A trace of points [n, 2]; 32 bits are finer than a screen and halve the page."""
     from plotly import graph_objects
 
-    x, y = _columns(points)
-    line = {"width": width, "dash": dash}
-    return graph_objects.Scatter(
-        x=x, y=y, mode="lines", name=_text(name), meta=role, line=line, opacity=opacity, hoverinfo="skip"
-    )
+    x, y = map(np.ascontiguousarray, np.asarray(points, np.float32).reshape(-1, 2).T)
+    return graph_objects.Scatter(x=x, y=y, **how)
 
 
 def _map_figure(traces: list[Any], box: np.ndarray, of: str) -> Any:
@@ -251,12 +242,6 @@ def _gapped(lines: np.ndarray) -> np.ndarray:
     """Lines [n, k, 2] as one line of points, interrupted after each."""
     gaps = np.full((len(lines), 1, 2), np.nan)
     return np.concatenate([lines, gaps], axis=1).reshape(-1, 2)
-
-
-def _columns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x and y of points [n, 2]; 32 bits are finer than a screen and halve the page."""
-    x, y = np.asarray(points, np.float32).reshape(-1, 2).T
-    return np.ascontiguousarray(x), np.ascontiguousarray(y)
 
 
 def _text(name: str) -> str:

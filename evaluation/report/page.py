@@ -87,13 +87,14 @@ def write_page(path: Path, runs: Sequence[PageRun], citation: str) -> None:
     reports = [report for report, _ in runs]
     charts = [run_charts(report) for report in reports]
     shown = {"overlay": overlay_chart(reports), "errors": error_chart(reports)} if len(runs) > 1 else {}
-    compared = {name: _figure_data(chart) for name, chart in shown.items() if chart is not None}
+    # Figures as plain data; their arrays of numbers are encoded as bytes.
+    compared = {name: json.loads(chart.to_json()) for name, chart in shown.items() if chart is not None}
     data = {
         "palette": PALETTE,
         "gridScales": GRID_SCALES,
         "runs": [
             {
-                "charts": {name: _figure_data(chart) for name, chart in drawn.items()},
+                "charts": {name: json.loads(chart.to_json()) for name, chart in drawn.items()},
                 "closures": closure_records(report.closures, report.run),
                 "views": view_records(report.views),
             }
@@ -107,7 +108,7 @@ def write_page(path: Path, runs: Sequence[PageRun], citation: str) -> None:
         style=(_TEMPLATES / "page.css").read_text(encoding="utf-8"),
         scripts=scripts,
         data=embedded_json(data),
-        runs=[_run_context(k, *run, drawn) for k, (run, drawn) in enumerate(zip(runs, charts, strict=True))],
+        runs=[_run_context(k, run, drawn) for k, (run, drawn) in enumerate(zip(runs, charts, strict=True))],
         comparison=[_comparison_row(report) for report in reports] if len(runs) > 1 else None,
         columns=_COLUMNS,
         compared_charts=list(compared),
@@ -130,33 +131,17 @@ def embedded_json(data: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _figure_data(figure: Any) -> Any:
-    """A figure as plain data; arrays of numbers are encoded as bytes."""
-    return json.loads(figure.to_json())
-
-
-def _run_context(
-    number: int, report: RunReport, settings: Sequence[tuple[str, str, str]] | None, charts: dict[str, Any]
-) -> dict[str, Any]:
+def _run_context(number: int, run: PageRun, charts: dict[str, Any]) -> dict[str, Any]:
     """What the template `run.html` shows of a run."""
+    report, settings = run
     return {
         "number": number,
-        "name": report.name,
-        "status": report.describe_status(),
+        "report": report,
         "unfinished": report.manifest.status == RUNNING,
-        "backend": report.backend,
-        "source": report.source,
-        "manifest": report.manifest,
-        "verdict": report.verdict,
-        "warnings": report.run.warnings,
         "score": describe_score(report.card),
         "figures": _key_figures(report),
-        "sections": report.card.lines(),
-        "closures": len(report.closures.verdicts),
-        "views": report.views is not None,
         "charts": [(name, *_CAPTIONS[name]) for name in charts if name != "map"],
         "settings": settings,
-        "files": report.files,
     }
 
 

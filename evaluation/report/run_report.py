@@ -90,13 +90,9 @@ class RunReport(NamedTuple):
         """How the run ended, in a few words."""
         count, total, status = len(self.run.time), self.manifest.total, self.manifest.status
         steps = f"{count:,} steps" if total in (None, count) else f"{count:,} of {total:,} steps"
-        if status == "complete":
-            return f"finished, {steps}"
-        if status == "interrupted":
-            return f"interrupted after {steps}"
-        if status == RUNNING:
-            return f"not finished: killed, or still running, after {steps}"
-        return f"ended as {status} after {steps}"
+        known = {"complete": "finished,", "interrupted": "interrupted after"}
+        known[RUNNING] = "not finished: killed, or still running, after"
+        return f"{known.get(status, f'ended as {status} after')} {steps}"
 
 
 def read_run_report(directory: Path) -> RunReport:
@@ -120,9 +116,8 @@ def read_run_report(directory: Path) -> RunReport:
     name = directory.resolve().name
     scored = (directory / "scorecard.json").exists()
     layers, lines, grid = _layers(directory, run)
-    file, score = directory / "gridscore.json", None
-    if file.exists():
-        score = read_json(file, "the scores of a grid", GridScore.model_validate)
+    file, expected = directory / "gridscore.json", "the scores of a grid"
+    score = read_json(file, expected, GridScore.model_validate) if file.exists() else None
     belief, belief_step = _belief(steps, count)
     cost_step, steps_of, seconds = _columns(directory / "timing.csv", "step", "steps", "seconds")
     online_time, online_error = _columns(directory / "online_error.csv", "t", "error")
@@ -159,10 +154,9 @@ def _method(directory: Path) -> dict[str, str]:
         given = read_plain_yaml(directory / "config.yaml", "the configuration of a run")
     except InputError:
         given = {}
-    source, backend = next((words for name, words in SOURCES.items() if given.get(name) is not None), ""), ""
-    if isinstance(given.get("backend"), str):
-        backend = given["backend"]
-    return {"backend": backend, "source": source}
+    source = next((words for name, words in SOURCES.items() if given.get(name) is not None), "")
+    backend = given.get("backend")
+    return {"backend": backend if isinstance(backend, str) else "", "source": source}
 
 
 def _layers(directory: Path, run: RunArrays) -> tuple[Layers, np.ndarray, OccupancyGrid | None]:

@@ -67,9 +67,8 @@ def describe_score(card: Scorecard) -> str:
     factor = ""
     if min(error.value, error.odometry) > 0:
         more = error.odometry / error.value
-        factor = (
-            f", {more:.2g} times as much" if more > 1 else f": the map is {1 / more:.2g} times as far off"
-        )
+        off = f": the map is {1 / more:.2g} times as far off"
+        factor = f", {more:.2g} times as much" if more > 1 else off
         factor = ", the same" if max(more, 1 / more) < 1.05 else factor
     worse = ", worse than odometry" * card.is_worse
     return f"{text}; that of odometry is {error.odometry:.3g} {error.unit}{factor}{worse}."
@@ -94,12 +93,6 @@ def summarise(directory: Path, card: Scorecard, method: str) -> str:
     run, source, closures = read_run(directory), read_manifest(directory).source, count_closures(directory)
     extent = f"{run.time[-1] - run.time[0]:.3g} s, {path_length(run.odometry):.3g} m by odometry"
     accepted = f"{closures.accepted} of {closures.proposed} proposed were accepted" if closures else "none"
-    return "\n".join(
-        [
-            f"{directory}: {len(run.time)} steps of {source} by {method}, {extent}",
-            render_error(card),
-            f"closures: {accepted}",
-            *(render_warnings(card) or ["warnings: none"]),
-            render_health(card),
-        ]
-    )
+    first = f"{directory}: {len(run.time)} steps of {source} by {method}, {extent}"
+    warnings = render_warnings(card) or ["warnings: none"]
+    return "\n".join([first, render_error(card), f"closures: {accepted}", *warnings, render_health(card)])

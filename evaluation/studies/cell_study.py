@@ -8,7 +8,7 @@ correlations; the pictures show scores over the parameters, and rate maps.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
-from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
+from pydantic import AfterValidator, Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from scipy.stats import qmc, rankdata
 
 from evaluation.plots import style
@@ -40,65 +40,50 @@ _Scores = dict[str, np.ndarray]
 """See `score_task`."""
 
 
-class _Sums:
-    """What is summed over the segments of a course, for B networks, in float64."""
+def _score_tracks(study: StudyCourse, count: int, tracks: Iterable[CellTrack]) -> _Scores:
+    """The scores of `count` networks, summed in float64 over the segments of their course."""
+    ring, unit = rings(study.config, np.dtype(float)), units(study.config, np.dtype(float))
+    place = len(study.y_edges) - 1, len(study.x_edges) - 1
+    bins, cells, steps = place[0] * place[1], len(study.chosen), len(study.expected)
+    before = np.tile(ring // 2, (count, 1))  # wrapped packets
+    followed = before.copy()  # the same, followed round the torus
+    squares, errors = np.zeros((count, 2)), np.zeros((count, 2))
+    reseeded, larger = np.zeros(count), np.zeros(count)
+    sums = np.zeros((count, cells * bins))
 
-    def __init__(self, study: StudyCourse, count: int) -> None:
-        self._study = study
-        self._ring, self._unit = rings(study.config, np.dtype(float)), units(study.config, np.dtype(float))
-        self._bins = (len(study.y_edges) - 1) * (len(study.x_edges) - 1)
-        self._before = np.tile(self._ring // 2, (count, 1))  # wrapped packets
-        self._packet = self._before.copy()  # the same, followed round the torus
-        self._last = np.zeros((count, 2))
-        self._squares, self._errors = np.zeros((count, 2)), np.zeros((count, 2))
-        self._reseeded, self._larger = np.zeros(count), np.zeros(count)
-        self._maps = np.zeros((count, len(study.chosen) * self._bins))
+    def shortest(difference: np.ndarray) -> np.ndarray:
+        return difference - ring * np.round(difference / ring)
 
-    def add(self, first: int, track: CellTrack) -> None:
-        """Adds a segment [B, S] that begins at step `first`."""
-        pose, activity, outcome, level = track
-        count, length = outcome.shape
-        rows = slice(first, first + length)
-        wrapped = np.concatenate([self._before[:, None], pose], axis=1)
-        gone = self._shortest(np.diff(wrapped, axis=1))
-        packet = self._packet[:, None] + np.cumsum(gone, axis=1)
-        self._before, self._packet = wrapped[:, -1], packet[:, -1]
-        error = packet - self._study.expected[None, rows]
-        drift = self._lengths(error)
-        self._last = drift[:, -1]
-        self._squares += (drift**2).sum(axis=1)
-        self._errors += self._lengths(self._shortest(error)).sum(axis=1)
-        self._reseeded += (outcome == Outcome.RESEEDED).sum(axis=1)
-        self._larger += (level > 0).sum(axis=1)
-        cells = activity.shape[2]
-        at = np.arange(cells) * self._bins + self._study.bin[rows, None]
-        at = at[None] + np.arange(count)[:, None, None] * (cells * self._bins)
-        weight = activity * self._study.seconds[None, rows, None]
-        self._maps += np.bincount(at.ravel(), weight.ravel(), self._maps.size).reshape(self._maps.shape)
-
-    def scores(self) -> _Scores:
-        """The scores of all steps added."""
-        study, steps = self._study, len(self._study.expected)
-        seconds = np.bincount(study.bin, study.seconds, self._bins)
-        maps = self._maps.reshape(len(self._maps), -1, self._bins)
-        mean = np.divide(maps, seconds, out=np.full_like(maps, np.nan), where=seconds > 0)
-        place = len(study.y_edges) - 1, len(study.x_edges) - 1
-        rms, mean_error = np.sqrt(self._squares / steps), self._errors / steps
-        return {
-            "drift": rms[:, 0], "drift_heading": rms[:, 1],
-            "drift_end": self._last[:, 0], "drift_heading_end": self._last[:, 1],
-            "decoding": mean_error[:, 0], "decoding_heading": mean_error[:, 1],
-            "reseeded": self._reseeded / steps, "larger": self._larger / steps,
-            "maps": mean.astype(np.float32).reshape(*maps.shape[:2], *place),
-        }  # fmt: skip
-
-    def _shortest(self, difference: np.ndarray) -> np.ndarray:
-        return difference - self._ring * np.round(difference / self._ring)
-
-    def _lengths(self, error: np.ndarray) -> np.ndarray:
+    def lengths(error: np.ndarray) -> np.ndarray:
         """[..., 2] m and rad of differences [..., 3] in cells."""
-        x, y, heading = np.moveaxis(error * self._unit, -1, 0)
+        x, y, heading = np.moveaxis(error * unit, -1, 0)
         return np.stack([np.hypot(x, y), np.abs(heading)], axis=-1)
+
+    for k, (pose, activity, outcome, level) in enumerate(tracks):
+        rows = slice(k * SEGMENT, k * SEGMENT + outcome.shape[1])
+        wrapped = np.concatenate([before[:, None], pose], axis=1)
+        packet = followed[:, None] + np.cumsum(shortest(np.diff(wrapped, axis=1)), axis=1)
+        before, followed = wrapped[:, -1], packet[:, -1]
+        error = packet - study.expected[None, rows]
+        drift = lengths(error)
+        squares += (drift**2).sum(axis=1)
+        errors += lengths(shortest(error)).sum(axis=1)
+        reseeded += (outcome == Outcome.RESEEDED).sum(axis=1)
+        larger += (level > 0).sum(axis=1)
+        at = np.arange(cells) * bins + study.bin[rows, None]
+        at = at[None] + np.arange(count)[:, None, None] * (cells * bins)
+        weight = activity * study.seconds[None, rows, None]
+        sums += np.bincount(at.ravel(), weight.ravel(), sums.size).reshape(sums.shape)
+    seconds, maps = np.bincount(study.bin, study.seconds, bins), sums.reshape(count, -1, bins)
+    mean = np.divide(maps, seconds, out=np.full_like(maps, np.nan), where=seconds > 0)
+    rms, mean_error = np.sqrt(squares / steps), errors / steps
+    return {
+        "drift": rms[:, 0], "drift_heading": rms[:, 1],
+        "drift_end": drift[:, -1, 0], "drift_heading_end": drift[:, -1, 1],
+        "decoding": mean_error[:, 0], "decoding_heading": mean_error[:, 1],
+        "reseeded": reseeded / steps, "larger": larger / steps,
+        "maps": mean.astype(np.float32).reshape(*maps.shape[:2], *place),
+    }  # fmt: skip
 
 
 FOLDER = "sets"
@@ -111,12 +96,8 @@ def _in_order(ends: tuple[float, float]) -> tuple[float, float]:
     return ends
 
 
-Range = Annotated[
-    tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]], AfterValidator(_in_order)
-]
-Width = Annotated[
-    tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]], AfterValidator(_in_order)
-]
+Range = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(_in_order)]
+Width = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_in_order)]
 
 
 class _CellPlan(Settings):
@@ -160,7 +141,7 @@ class _CellStudy(NamedTuple):
         """Hash of all that decides the scores, apart from the code."""
         plan = self.plan
         content = hashlib.sha256(f"{self.course.config!r} {plan.chunk} {plan.precision}".encode())
-        for array in jax.tree.leaves((self.course[2:], self.parameters)):
+        for array in jax.tree.leaves((self.course[1:], self.parameters)):
             content.update(f"{array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return content.hexdigest()[:16]
 
@@ -195,21 +176,18 @@ def run_cell_study(
     Raises:
         InputError: the folder cannot be written to, or the process of a chunk was killed.
     """
-    files = {task.key: folder / FOLDER / f"{task.key}.npz" for task in tasks_of(study)}
+    tasks = {folder / FOLDER / f"{task.key}.npz": task for task in tasks_of(study)}
     with os_errors_of(folder, "cannot be made", "a folder to write to"):
         (folder / FOLDER).mkdir(parents=True, exist_ok=True)
-    missing = []
-    for task, path in zip(tasks_of(study), files.values(), strict=True):
-        if path.exists():
-            done(len(task.parameters))
-        else:
-            missing.append(task)
-    with closing(executor.completed(score_task, missing)) as completed:
+    missing = [path for path in tasks if not path.exists()]
+    for path in tasks.keys() - missing:
+        done(len(tasks[path].parameters))
+    with closing(executor.completed(score_task, [tasks[path] for path in missing])) as completed:
         for index, scores in completed:
-            write_atomically(files[missing[index].key], partial(_save_scores, scores))
-            done(len(missing[index].parameters))
+            write_atomically(missing[index], partial(_save_scores, scores))
+            done(len(tasks[missing[index]].parameters))
     parts = []
-    for path in files.values():
+    for path in tasks:
         with np.load(path) as found:
             parts.append(dict(found))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -240,15 +218,10 @@ def score_task(task: _CellStudy) -> _Scores:
     prepare_precision(plan.precision)
     rows = np.arange(plan.chunk).clip(max=count - 1)
     sets = CellSets(**dict(zip(PARAMETERS, task.parameters[rows].T, strict=True)))
-    precise = {
-        name: np.asarray(getattr(study.course, name), np.dtype(plan.precision))
-        for name in ("motion", "noise", "turned", "energy")
-    }
-    course = study.course._replace(**precise)
-    sums = _Sums(study, plan.chunk)
-    for k, track in enumerate(walk(study.config, sets, course, study.chosen)):
-        sums.add(k * SEGMENT, track)
-    return {name: column[:count] for name, column in sums.scores().items()}
+    names, dtype = ("motion", "noise", "turned", "energy"), np.dtype(plan.precision)
+    course = study.course._replace(**{name: np.asarray(getattr(study.course, name), dtype) for name in names})
+    scores = _score_tracks(study, plan.chunk, walk(study.config, sets, course, study.chosen))
+    return {name: column[:count] for name, column in scores.items()}
 
 
 def _save_scores(scores: _Scores, path: Path) -> None:
@@ -270,8 +243,6 @@ def _draw_scores(
     Args:
         parameters: by label with unit. score: on a logarithmic axis if positive. label: with unit.
     """
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-
     size = float(np.clip(40 / np.sqrt(len(score)), 4, 10))
     rows = -(-len(parameters) // _COLUMNS)
     height = style.TOP + rows * (_PANEL + _GAP_UP)
@@ -286,9 +257,7 @@ def _draw_scores(
         axes.grid(color=style.LINE_GREY, lw=0.7)
         if score.min() > 0:
             axes.set_yscale("log")
-            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=30))
-            axes.yaxis.set_minor_locator(NullLocator())
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
+            style.log_ticks(axes.yaxis, (1, 2, 5))
             axes.set_ylim(0.5 * score.min(), 2 * score.max())
         axes.locator_params(axis="x", nbins=4)
         axes.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
@@ -317,10 +286,8 @@ def _draw_rate_maps(
             axes = style.add_axes(figure, style.LEFT + column * (side + _MAP_GAP), bottom, side, side)
             draw_rate_map(axes, rates, x_edges, y_edges)
             axes.set_title(f"{np.nanmax(rates):.2g}", fontsize=7, color=LABEL_GREY, pad=2)
-        figure.text(
-            0.5 * style.LEFT / WIDTH, (bottom + side / 2) / height, name, rotation=90, fontsize=9,
-            ha="center", va="center", color=style.INK,
-        )  # fmt: skip
+        at = 0.5 * style.LEFT / WIDTH, (bottom + side / 2) / height
+        figure.text(*at, name, rotation=90, fontsize=9, ha="center", va="center", color=style.INK)
     return figure
 
 
@@ -357,33 +324,24 @@ def render_cells(study: _CellStudy, scores: _Scores) -> str:
 def save_cells(study: _CellStudy, scores: _Scores, folder: Path) -> list[Path]:
     """Writes table.csv with all sets, table.md, maps.npz with all rate maps, and the pictures drift.png,
     decoding.png and maps.png."""
-    columns, course = _columns(study, scores), study.course
-    rows = [{name: float(column[k]) for name, column in columns.items()} for k in range(len(scores["drift"]))]
-    arrays: dict[str, Any] = {"maps": scores["maps"], "cell": course.chosen}
-    arrays |= {"x_edges": course.x_edges, "y_edges": course.y_edges}
+    columns, line, name = _columns(study, scores), _describe(study), study.name
+    edges: dict[str, Any] = {"x_edges": study.course.x_edges, "y_edges": study.course.y_edges}
+    count = len(scores["drift"])
+    rows = [{"set": k, **{each: float(column[k]) for each, column in columns.items()}} for k in range(count)]
+    parameters = {f"{each} ({UNITS[each]})".removesuffix(" ()"): columns[each] for each in PARAMETERS}
+    drift, decoding, maps = (scores[each] for each in ("drift", "decoding", "maps"))
+    chosen = {each: maps[k] for each, k in _chosen(scores).items()}
+    title = f"Decoding error: {name}"
+    sets = f"Least, median and most drift of {count} sets; above each map its largest activity"
     files = {
-        "table.csv": csv_text([{"set": k} | row for k, row in enumerate(rows)]),
+        "table.csv": csv_text(rows),
         "table.md": f"{render_cells(study, scores)}\n",
-        "maps.npz": partial(np.savez_compressed, **arrays),
+        "maps.npz": partial(np.savez_compressed, maps=maps, cell=study.course.chosen, **edges),
+        "drift.png": _draw_scores(f"Drift: {name}", line, parameters, drift, "drift, rms (m)"),
+        "decoding.png": _draw_scores(title, line, parameters, decoding, "decoding error (m)"),
+        "maps.png": _draw_rate_maps(f"Rate maps by drift: {name}", sets, chosen, **edges),
     }
-    return save_files(folder, files | _figures(study, scores))
-
-
-def _figures(study: _CellStudy, scores: _Scores) -> dict[str, style.Figure]:
-    columns, line, course = _columns(study, scores), _describe(study), study.course
-    parameters = {f"{name} ({UNITS[name]})".removesuffix(" ()"): columns[name] for name in PARAMETERS}
-    rows = {name: scores["maps"][k] for name, k in _chosen(scores).items()}
-    drift, decoding = (
-        _draw_scores(f"{what}: {study.name}", line, parameters, scores[name], label)
-        for name, what, label in (
-            ("drift", "Drift", "drift, rms (m)"),
-            ("decoding", "Decoding error", "decoding error (m)"),
-        )
-    )
-    sets = f"Least, median and most drift of {len(scores['drift'])} sets; above each map its largest activity"
-    title = f"Rate maps by drift: {study.name}"
-    maps = _draw_rate_maps(title, sets, rows, course.x_edges, course.y_edges)
-    return {"drift.png": drift, "decoding.png": decoding, "maps.png": maps}
+    return save_files(folder, files)
 
 
 def _chosen(scores: _Scores) -> dict[str, int]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from ratslam.cli.common import INPUT_ERROR, Commands, add_config, positive_integer, prepare_jax, read_config
 from ratslam.runs.settings.packaged import find_config
@@ -34,15 +34,12 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
-    study = commands.add(
-        "study", _study, "run many configurations over seeds and compare them",
-        "study study_maze", "study",
-    )  # fmt: skip
+    does = "run many configurations over seeds and compare them"
+    study = commands.add("study", _study, does, "study study_maze", "study")
     add_config(study, "study file, or a configuration with --preset (YAML)")
     study.add_argument("--preset", choices=PRESETS, help="make the study from a configuration")
-    study.add_argument(
-        "--search", action="store_true", help="search parameters by the study's `tune` section"
-    )
+    tune = "search parameters by the study's `tune` section"
+    study.add_argument("--search", action="store_true", help=tune)
     study.add_argument(
         "--workers", type=positive_integer, metavar="N",
         help="Dask processes (default: one per core; 1 without Dask, and 1 with `report: pareto`, so that no "
@@ -63,13 +60,11 @@ def add_commands(commands: Commands) -> None:
 
     size = commands.add("size", _size, "recommend settings for a scene", "size whisker_maze", "study")
     add_config(size)
-    size.add_argument(
-        "--cycles", type=positive_integer, default=CYCLES, metavar="N",
-        help=f"length of the trial session (default {CYCLES})",
-    )  # fmt: skip
+    length = f"length of the trial session (default {CYCLES})"
+    size.add_argument("--cycles", type=positive_integer, default=CYCLES, metavar="N", help=length)
 
 
-class _Progress:
+class _Progress(AbstractContextManager["_Progress"]):
     """A progress bar over runs, which collects the failed ones.
 
     Args:
@@ -83,9 +78,6 @@ class _Progress:
 
         self._bar = tqdm(total=total, unit=unit, file=sys.stderr, mininterval=0.5, delay=1.0)
 
-    def __enter__(self) -> Self:
-        return self
-
     def __call__(self, record: Any) -> None:
         """Counts a run."""
         if record.error is not None:
@@ -96,9 +88,7 @@ class _Progress:
         """Counts runs that did not fail."""
         self._bar.update(runs)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *details: object) -> None:
         self._bar.close()
         if kind is KeyboardInterrupt:
             tell(f"{self._bar.n} {self._bar.unit}s are kept in {self._path}; the same command continues")
@@ -207,10 +197,8 @@ def _cells(arguments: argparse.Namespace) -> int:
 
     study = cell_study(find_config(arguments.config), arguments.set)
     folder = _folder(arguments, study.name, "sets")
-    with (
-        _Progress(study.plan.sets, folder / FOLDER, "set") as progress,
-        Executor(arguments.workers, arguments.scheduler) as executor,
-    ):
+    progress = _Progress(study.plan.sets, folder / FOLDER, "set")
+    with progress, Executor(arguments.workers, arguments.scheduler) as executor:
         scores = run_cell_study(study, folder, executor, progress.count)
     paths = save_cells(study, scores, folder)
     print(render_cells(study, scores))
@@ -222,13 +210,7 @@ def _size(arguments: argparse.Namespace) -> None:
     if arguments.cycles < FEWEST_CYCLES:
         raise InputError("--cycles", str(arguments.cycles), f"{FEWEST_CYCLES} or more")
     _prepare()
-    from evaluation.studies.recommendation import (
-        changed_settings_yaml,
-        recommend,
-        render_recommendations,
-        render_trial_runs,
-        try_settings,
-    )
+    from evaluation.studies import recommendation as advice
     from evaluation.studies.scene_statistics import scene_of, with_tier
     from ratslam.runs.build_session import open_source
     from ratslam.runs.settings.completion import complete
@@ -236,11 +218,11 @@ def _size(arguments: argparse.Namespace) -> None:
     path, config = arguments.config, read_config(arguments)
     with open_source(with_tier(config, "kinematic")) as source:
         scene, config = scene_of(source), complete(config, source)
-    found = recommend(config, scene)
+    found = advice.recommend(config, scene)
     print("trial runs take a minute or two, and several on a busy machine", flush=True)
-    print(f"{scene.describe()}\n\n{render_recommendations(found)}\n", flush=True)
-    runs = try_settings(config, found, arguments.cycles)
+    print(f"{scene.describe()}\n\n{advice.render_recommendations(found)}\n", flush=True)
+    runs = advice.try_settings(config, found, arguments.cycles)
     print(f"Cost of each cheaper step, over {runs[0].steps} of {scene.cycles} cycles, one seed:\n")
-    print(render_trial_runs(runs))
-    text = changed_settings_yaml(found)
+    print(advice.render_trial_runs(runs))
+    text = advice.changed_settings_yaml(found)
     print(f"\nFor {path.name}:\n\n{text}" if text else f"\n{path.name} has these settings already")

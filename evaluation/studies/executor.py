@@ -172,19 +172,15 @@ class Executor(ExitStack):
         """(index, result) in the order of completion, without those of processes that were killed."""
         environment = {name: os.environ[name] for name in ENVIRONMENT if name in os.environ}
         pool = self._client.get_executor(pure=False)
-        pending = {
-            pool.submit(_call_in_worker, environment, pickle.dumps((function, task))): index
-            for index, task in enumerate(tasks)
-        }
+        packed = (pickle.dumps((function, task)) for task in tasks)
+        pending = {pool.submit(_call_in_worker, environment, each): k for k, each in enumerate(packed)}
         for future in futures.as_completed(pending):
             try:
                 result = future.result()
             except Exception as error:
                 if self._scheduler is not None and isinstance(error, futures.CancelledError):
-                    cure = "what was done is kept; run it again"
-                    raise InputError(
-                        "--scheduler", "the scheduler went away", "one that stays", cure
-                    ) from None
+                    found, cure = "the scheduler went away", "what was done is kept; run it again"
+                    raise InputError("--scheduler", found, "one that stays", cure) from None
                 unloadable = isinstance(error, ImportError) or "deserialization" in str(error)
                 if self._scheduler is not None and unloadable:
                     found = f"its processes cannot load ratslam ({error})".splitlines()[0]

@@ -26,14 +26,7 @@ from evaluation.metrics.trajectory import ate
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, PURPLE, VERMILLION
 from evaluation.studies.executor import Executor
-from evaluation.studies.machine import (
-    Machine,
-    compilations,
-    machine,
-    peak_memory,
-    reset_peak_memory,
-    watch_load,
-)
+from evaluation.studies.machine import Machine, compilations, watch_machine
 from evaluation.studies.metrics import FALSE_CLOSURE_DISTANCE, closure_errors
 from evaluation.studies.perturbation import repeat_course
 from evaluation.studies.run_job import KILLED, read_records
@@ -268,8 +261,7 @@ def measure_growth(task: _GrowthTask, done: Callable[[], object] = lambda: None)
         rows, clock = read_observations(source), _StepClock()
         truth, motion = list[np.ndarray](), list[np.ndarray]()
         for before, length in pairwise([0, *task.lengths]):
-            load = watch_load()
-            reset_peak_memory()
+            watched = watch_machine()
             window = min(task.window or length, length - before)
             for step, (sample, observation) in enumerate(islice(rows, length - before)):
                 if step == length - before - window:
@@ -279,12 +271,11 @@ def measure_growth(task: _GrowthTask, done: Callable[[], object] = lambda: None)
                 truth.append(sample.truth)
                 motion.append(np.asarray(observation.odometry[:3], float))
                 done()
-            times = clock.read() | {"memory": peak_memory()}
-            here = machine().model_copy(update={"other_load": load()})
+            times, (memory, here) = clock.read(), watched()
             errors = _errors(session, np.array(truth), integrate(np.array(motion)))
-            keyframes = session.backend.rows(session.state)
-            found = {"keyframes": keyframes, "machine": here, **times, **errors}
-            yield _GrowthRow.model_validate({"ground": task.ground, "steps": length, **found})
+            found = {"keyframes": session.backend.rows(session.state), "memory": memory, "machine": here}
+            found |= {"ground": task.ground, "steps": length, **times, **errors}
+            yield _GrowthRow.model_validate(found)
 
 
 def _errors(session: Session, truth: np.ndarray, odometry: np.ndarray) -> dict[str, float]:
@@ -373,10 +364,8 @@ def _draw(name: str, rows: Sequence[_GrowthRow]) -> Figure | None:
     for ground, color in zip(grounds, _COLORS, strict=False):
         these = [row.ground == ground for row in timed]
         for values, (statistic, dash, mark) in zip(cost[these].T, _DASHES, strict=True):
-            axes.plot(
-                steps[these], values, dash, color=color, lw=1.5, marker=mark, ms=4.5, mew=0,
-                label=f"{ground}, {statistic}",
-            )  # fmt: skip
+            text = f"{ground}, {statistic}"
+            axes.plot(steps[these], values, dash, color=color, lw=1.5, marker=mark, ms=4.5, mew=0, label=text)
     style.name_axes(axes, "length of the session (steps)", "processor time of a step (ms), own thread")
     return style.add_legend(figure, axes, columns=len(grounds))
 
@@ -393,10 +382,8 @@ def _append_rows(path: Path, task: _GrowthTask) -> str | None:
     from tqdm import tqdm
 
     tqdm.set_lock(RLock())  # the default is a semaphore, which is left over when this process is ended
-    with (
-        tqdm(total=task.lengths[-1], desc=task.ground, unit="step", file=sys.stderr, mininterval=0.5) as bar,
-        path.open("a", encoding="utf-8") as file,
-    ):
+    bar = tqdm(total=task.lengths[-1], desc=task.ground, unit="step", file=sys.stderr, mininterval=0.5)
+    with bar, path.open("a", encoding="utf-8") as file:
         for row in measure_growth(task, bar.update):
             file.write(row.model_dump_json() + "\n")
             file.flush()

@@ -29,12 +29,11 @@ _IDLE = slice(3, 5)  # idle time and time waiting for a disk, among the times of
 
 def processor_name() -> str:
     """Name of the processor."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 @contextmanager
@@ -117,14 +116,17 @@ def machine() -> Machine:
     """This machine."""
     import jax
 
-    device = jax.devices()[0]
-    return Machine(
-        processor=processor_name(),
-        device="cpu" if device.platform == "cpu" else device.device_kind,
-        versions={name: version(name) for name in ("jax", "jaxlib", "numpy")}
-        | {"python": platform.python_version()},
-        build=code_digest(),
-    )
+    device, libraries = jax.devices()[0], ("jax", "jaxlib", "numpy")
+    kind = "cpu" if device.platform == "cpu" else device.device_kind
+    versions = {name: version(name) for name in libraries} | {"python": platform.python_version()}
+    return Machine(processor=processor_name(), device=kind, versions=versions, build=code_digest())
+
+
+def watch_machine() -> Callable[[], tuple[float, Machine]]:
+    """A function for the peak memory since, MiB, and this machine with the load of other processes since."""
+    load = watch_load()
+    reset_peak_memory()
+    return lambda: (peak_memory(), machine().model_copy(update={"other_load": load()}))
 
 
 class Stopwatch:

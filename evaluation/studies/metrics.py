@@ -7,7 +7,7 @@ of different places.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -69,9 +69,9 @@ DEFAULT_ERRORS = ("energy_all", "ate_final", "map_error", "relations_translation
 """Errors of a Pareto front, tried in this order if none is named."""
 
 
-def quantity(name: str, finding: Finding) -> dict[str, Quantity]:
-    """A finding under its name, with label and unit."""
-    return {name: METRICS[name].quantity(finding)}
+def quantities_of(findings: Mapping[str, Finding]) -> dict[str, Quantity]:
+    """Findings by name, with label and unit."""
+    return {name: METRICS[name].quantity(finding) for name, finding in findings.items()}
 
 
 def find_error(name: str) -> str:

@@ -156,9 +156,8 @@ class _Fleet:
             activity = cells.activity._replace(blocks=cells.activity.blocks[:1])
             states.append((cells._replace(activity=activity), packet))
         together = jax.tree.map(lambda *leaves: np.stack(leaves), *states)
-        after, track = jax.device_get(
-            _walk(self._config, self._of(members), together, rows, self._chosen, together=True)
-        )
+        these = self._of(members), together, rows, self._chosen
+        after, track = jax.device_get(_walk(self._config, *these, together=True))
         found = {}
         for j, k in enumerate(group):
             if not track.level[j].any():
@@ -212,9 +211,8 @@ def _walk(
         def step(walker: Walker, row: CellCourse) -> tuple[Walker, CellTrack]:
             cells, packet = walker
             faster, turn = 1 + own.speed_noise * row.noise[0], own.heading_noise * row.noise[1]
-            moved = Odometry(
-                row.motion[0] * faster, row.motion[1] * faster, row.motion[2] + turn, jnp.ones((), dtype)
-            )
+            along, aside = row.motion[0] * faster, row.motion[1] * faster
+            moved = Odometry(along, aside, row.motion[2] + turn, jnp.ones((), dtype))
             seen = packet[row.template]
             # A template is learnt with the packet before the step.
             packet = packet.at[row.template].set(jnp.where(row.novel, cells.pose, seen))

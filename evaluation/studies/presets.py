@@ -16,7 +16,9 @@ from ratslam.runs.settings.yaml_document import Place
 from robot.simulation.head.simulated_session import choose_tier
 from tactile.base.errors import InputError
 
-PARTS: dict[str, dict[str, Any]] = {
+_Rows = dict[str, dict[str, Any]]
+"""Settings of each row, by key path."""
+PARTS: _Rows = {
     "all parts on": {},
     "classic backend": {"backend": "classic"},
     "without sector shifts": {"recall.shifts": 0},
@@ -33,7 +35,7 @@ PARTS: dict[str, dict[str, Any]] = {
 }
 """Parts that `ablate` turns off, by setting; and cuts of the odometry, which are off unless configured."""
 CLASSIC: dict[str, Any] = {"backend": "classic", "templates.energy": 0.05}  # the classic backend for whiskers
-CHOICES: dict[str, dict[str, Any]] = {
+CHOICES: _Rows = {
     "as configured": {},
     "9 headings": {"backend": "recall", "pose_cells.cells_heading": 9},
     "18 headings": {"backend": "recall", "pose_cells.cells_heading": 18},
@@ -44,10 +46,7 @@ CHOICES: dict[str, dict[str, Any]] = {
 """Rows of `pareto`."""
 PARTICLES = (30, 100, 300)  # particles of the grid filter in `pareto`, for simulated whiskers
 TIERS = ("kinematic", "quasistatic", "dynamic")  # fidelities of simulation, the cheapest first
-METHODS: dict[str, dict[str, Any]] = {
-    "classic": CLASSIC | {"templates.threshold": 0.04},
-    "recall": {"backend": "recall"},
-}
+METHODS: _Rows = {"classic": CLASSIC | {"templates.threshold": 0.04}, "recall": {"backend": "recall"}}
 """Backends that `tiers` runs on the images of each tier."""
 
 
@@ -78,7 +77,7 @@ def _content(
     name: str, document: Document, config: RunConfig, by: float, seconds: float
 ) -> tuple[dict[str, Any], list[str]]:
     """The content of a study file without base and seeds, and remarks."""
-    rows: dict[str, dict[str, Any]]
+    rows: _Rows
     match name:
         case "ablate":
             return {"rows": PARTS, "report": "differences"}, []
@@ -95,10 +94,9 @@ def _content(
             return _tiers(config, seconds)
     rows = dict(CHOICES)
     if config.recording is None:
-        rows |= {
-            f"grid, {count}": {"backend": "grid", "grid.particles": count, "session.precision": "float32"}
-            for count in PARTICLES
-        }
+        for count in PARTICLES:
+            grid = {"backend": "grid", "grid.particles": count, "session.precision": "float32"}
+            rows[f"grid, {count}"] = grid
     if config.simulation is not None:
         rows["quasistatic"] = {"simulation.fidelity": "quasistatic"}
     return {"rows": rows, "seeds": 3, "pace": "live", "report": "pareto"}, []
@@ -114,7 +112,7 @@ def _tiers(config: RunConfig, seconds: float) -> tuple[dict[str, Any], list[str]
     short = shortened(config, seconds).simulation
     assert short is not None
     length = {"explore": short.path.explore} if short.path.explore else {"circuits": short.path.circuits}
-    rows: dict[str, dict[str, Any]] = {
+    rows: _Rows = {
         f"{name}, {method}": settings | {"simulation.fidelity": name, "simulation.raw": False}
         for name in TIERS
         for method, settings in METHODS.items()

@@ -99,9 +99,8 @@ def _rat(config: RunConfig, scene: Scene) -> Iterator[_Recommendation]:
     yield _engine(config, network_of(cells, config.attractor).model_copy(update=fitting))
     step = 2 * np.pi / cells.cells_heading
     turns = f"a turn of {scene.turn:.2g} rad takes {_parts(scene.turn / step)} sub-steps"
-    yield _of(
-        config, "pose_cells.cells_heading", cells.cells_heading, f"{np.degrees(step):.3g} degrees; {turns}"
-    )
+    why = f"{np.degrees(step):.3g} degrees; {turns}"
+    yield _of(config, "pose_cells.cells_heading", cells.cells_heading, why)
     yield _of(config, "backend", "recall", "weighs runs of views; classic takes the best single view")
     yield _of(config, "session.precision", "float64", "what the published figures are of")
 
@@ -109,11 +108,8 @@ def _rat(config: RunConfig, scene: Scene) -> Iterator[_Recommendation]:
 def _cell_size(config: RunConfig, scene: Scene) -> _Recommendation:
     now = config.pose_cells.cell_size
     moved, most = scene.usual / now, scene.most / now
-    why = (
-        f"a cycle moves {moved:.2g} cells (95 %: {most:.2g}): "
-        f"{_parts(most)} sub-steps of {LARGEST_SUBSTEP:g} at most"
-    )
-    value = now
+    steps = f"{_parts(most)} sub-steps of {LARGEST_SUBSTEP:g} at most"
+    value, why = now, f"a cycle moves {moved:.2g} cells (95 %: {most:.2g}): {steps}"
     if _parts(most) > PARTS:
         value, why = _round_number(scene.most / (LARGEST_SUBSTEP * PARTS), 1), f"{why}, where {PARTS} will do"
     elif moved < SLOW:
@@ -128,11 +124,9 @@ def _cells_xy(config: RunConfig, scene: Scene, size: float) -> _Recommendation:
     # What recall and its map do is the same on any torus: then the one there is will do.
     value = now if config.backend == "recall" and FEWEST <= now <= cover else cover
     wraps = span / (value * size)
-    spanned = f"the path spans {span / size:.0f} cells: " + (
-        f"wraps {wraps:.1f} x" if wraps > 1 else "none twice"
-    )
-    free = ", which recall does not mind" if config.backend == "recall" and wraps > 1 else ""
-    return _of(config, "pose_cells.cells_xy", value, spanned + free)
+    free = ", which recall does not mind" * (config.backend == "recall")
+    twice = f"wraps {wraps:.1f} x{free}" if wraps > 1 else "none twice"
+    return _of(config, "pose_cells.cells_xy", value, f"the path spans {span / size:.0f} cells: {twice}")
 
 
 def _engine(config: RunConfig, proposed: NetworkConfig) -> _Recommendation:
@@ -163,11 +157,9 @@ def _grid(config: RunConfig, scene: Scene) -> Iterator[_Recommendation]:
     yield _of(config, "grid.cell", cell, f"as fine as the mark of a contact, {blob:g} m")
     why = f"{span:.3g} m of path and what whiskers reach from it: {across} cells"
     yield _of(config, "grid.side", side, why)
-    why = (
-        f"{PER_CELL} for each cell ({off:.2g}) that odometry is off across the scene; {count * each:.0f} MiB"
-    )
-    less = f", {wanted} do not fit in {MEMORY}" if count < wanted else ""
-    yield _of(config, "grid.particles", count, why + less)
+    room = f"{count * each:.0f} MiB" + f", {wanted} do not fit in {MEMORY}" * (count < wanted)
+    why = f"{PER_CELL} for each cell ({off:.2g}) that odometry is off across the scene; {room}"
+    yield _of(config, "grid.particles", count, why)
     yield _of(config, "session.precision", "float32", "half the memory; evidence needs no more digits")
 
 
@@ -176,10 +168,9 @@ def _tier(config: RunConfig) -> Iterator[_Recommendation]:
     if simulation is None:
         return
     tier, reason = choose_tier(simulation.model_copy(update={"fidelity": "auto"}))
-    value = "auto" if simulation.fidelity == "auto" else tier
-    named = f"{tier}: " if value == "auto" else ""
-    why = f"{named}{reason}; `study --preset tiers` compares them"
-    yield _of(config, "simulation.fidelity", value, why)
+    auto = simulation.fidelity == "auto"
+    why = f"{tier}: " * auto + f"{reason}; `study --preset tiers` compares them"
+    yield _of(config, "simulation.fidelity", "auto" if auto else tier, why)
 
 
 def _parts(cells: float) -> int:
@@ -195,7 +186,7 @@ ENERGY = 0.05
 
 def cheaper_steps(config: RunConfig) -> dict[str, dict[str, Any]]:
     """The next cheaper step in every direction: settings in place of the recommended ones, by name."""
-    grid, steps = config.grid, dict[str, dict[str, Any]]()
+    grid, cells, steps = config.grid, config.pose_cells, dict[str, dict[str, Any]]()
     if config.backend == "grid":
         fewer = max(2, grid.particles // FEWER)
         if fewer < grid.particles:
@@ -203,7 +194,19 @@ def cheaper_steps(config: RunConfig) -> dict[str, dict[str, Any]]:
         size = float(f"{grid.cell * COARSER:.3g}")
         steps[f"cells of {size:g} m"] = {"grid.cell": size}
     else:
-        steps = _cheaper_cells(config)
+        fewer = max(FEWEST, cells.cells_xy // 2) | 1
+        if cells.cells_xy > FEWEST:
+            steps[f"{fewer} cells"] = {"pose_cells.cells_xy": fewer}
+        size = float(f"{cells.cell_size * COARSER:.3g}")
+        across = max(FEWEST, round(cells.cells_xy / COARSER)) | 1
+        steps[f"cells of {size:g} m"] = {"pose_cells.cell_size": size, "pose_cells.cells_xy": across}
+        turns = max(12, round(cells.cells_heading / COARSER))
+        if turns < cells.cells_heading:
+            steps[f"{turns} cells of heading"] = {"pose_cells.cells_heading": turns}
+        if config.backend == "recall":
+            steps["classic backend"] = {"backend": "classic"}
+            if config.recording is None and "energy" not in config.templates.model_fields_set:
+                steps["classic backend"]["templates.energy"] = ENERGY
     if config.session.precision == "float64":
         steps["float32"] = {"session.precision": "float32"}
     if config.simulation is not None and (config.simulation.raw or config.simulation.fidelity == "dynamic"):
@@ -242,21 +245,3 @@ def render_trial_runs(records: Sequence[RunRecord]) -> str:
     plan = StudyPlan(base=Path(), pace="live", report="costs")
     failed = [f"{record.row}: {record.error}" for record in records if record.error is not None]
     return "\n".join([render(make_report("", plan, records)), *failed])
-
-
-def _cheaper_cells(config: RunConfig) -> dict[str, dict[str, Any]]:
-    cells, steps = config.pose_cells, dict[str, dict[str, Any]]()
-    if cells.cells_xy > FEWEST:
-        fewer = max(FEWEST, cells.cells_xy // 2) | 1
-        steps[f"{fewer} cells"] = {"pose_cells.cells_xy": fewer}
-    size = float(f"{cells.cell_size * COARSER:.3g}")
-    across = max(FEWEST, round(cells.cells_xy / COARSER)) | 1
-    steps[f"cells of {size:g} m"] = {"pose_cells.cell_size": size, "pose_cells.cells_xy": across}
-    turns = max(12, round(cells.cells_heading / COARSER))
-    if turns < cells.cells_heading:
-        steps[f"{turns} cells of heading"] = {"pose_cells.cells_heading": turns}
-    if config.backend == "recall":
-        steps["classic backend"] = {"backend": "classic"}
-        if config.recording is None and "energy" not in config.templates.model_fields_set:
-            steps["classic backend"]["templates.energy"] = ENERGY
-    return steps

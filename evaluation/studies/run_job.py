@@ -27,16 +27,8 @@ from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import anchored_errors, recognition_error
 from evaluation.metrics.scorecard import score_run
 from evaluation.studies.executor import Executor
-from evaluation.studies.machine import (
-    Machine,
-    Stopwatch,
-    machine,
-    one_core,
-    peak_memory,
-    reset_peak_memory,
-    watch_load,
-)
-from evaluation.studies.metrics import closure_errors, quantity
+from evaluation.studies.machine import Machine, Stopwatch, machine, one_core, watch_machine
+from evaluation.studies.metrics import closure_errors, quantities_of
 from evaluation.studies.perturbation import perturb
 from evaluation.studies.scene_statistics import compare_with_tier
 from evaluation.studies.study import Job, run_key
@@ -135,15 +127,14 @@ def run_job(job: Job, kernels: Path | None = None) -> RunRecord:
     """
     if kernels is not None:
         jax.config.update("jax_compilation_cache_dir", str(kernels / job.hash))
-    load = watch_load()
-    reset_peak_memory()
+    watched = watch_machine()
     try:
         with _precision(job.config.session.precision):
             found = _play(job)
     except InputError as error:
         return _record_of(job, str(error), machine())
-    measured = found["measured"] | {"memory": peak_memory()}
-    here = machine().model_copy(update={"other_load": load()})
+    memory, here = watched()
+    measured = found["measured"] | {"memory": memory}
     return _record_of(job).model_copy(update=found | {"measured": measured, "machine": here})
 
 
@@ -167,17 +158,14 @@ def _play(job: Job) -> dict[str, Any]:
         run, lost = _take_steps(session, source, job.pace, watch)
         exm = config.score.experience_metric
         quantities = score_run(run, source.name, exm=exm, relations=relations).quantities
-        quantities |= quantity("recognition_error", recognition_error(quantities)) | extra
+        quantities |= quantities_of({"recognition_error": recognition_error(quantities)}) | extra
         closures, false = session.map.closures(), np.nan
         if run.truth is not None:
             apart = closure_errors(run.truth, closures)
             false = int((apart > SAME_PLACE * config.pose_cells.cell_size).sum())
-        quantities |= quantity("closures", Finding(len(closures)))
-        quantities |= quantity("false_closures", Finding(false))
-        quantities |= quantity("lost_share", Finding(lost))
-        for name, finding in anchored_errors(run).items():
-            quantities |= quantity(name, finding)
-        quantities |= _grid_map(session, source)
+        counts = {"closures": len(closures), "false_closures": false, "lost_share": lost}
+        findings = {name: Finding(value) for name, value in counts.items()} | anchored_errors(run)
+        quantities |= quantities_of(findings) | _grid_map(session, source)
     outcome = {"steps": len(run.time), "source": source.digest, "quantities": quantities}
     return outcome | {"measured": watch.times()}
 
@@ -229,7 +217,7 @@ def _grid_map(session: Session, source: Source) -> dict[str, Quantity]:
         found = score_grid(grid, true_grid(read_arena(folder / "arena.txt"), grid))
     error = found.under(MAIN_CONVENTION)
     note = f"0.3 everywhere {error.prior:.3g}, the best constant {error.best:.3g}"
-    return quantity("map_error", Finding(error.error, note=note)) | found.quantities
+    return quantities_of({"map_error": Finding(error.error, note=note)}) | found.quantities
 
 
 @contextmanager

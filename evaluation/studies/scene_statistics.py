@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evaluation.metrics.metric import Finding, Quantity
-from evaluation.studies.metrics import image_difference, quantity
+from evaluation.studies.metrics import image_difference, quantities_of
 from evaluation.studies.study import with_settings
 from ratslam.runs.build_session import open_observations, open_source
 from ratslam.runs.run import open_recorder
@@ -42,11 +42,9 @@ def compare_with_tier(config: RunConfig, log: InMemorySource, cost: float, tier:
     reference = _reference_views(with_tier(config, tier).model_dump_json())
     contact, height = image_difference(log.views, reference, config.touch.image.tallest)
     duration = float(log.time[-1] - log.time[0])
-    return (
-        quantity("simulation_time", Finding(1e6 * cost / duration))
-        | quantity("contact_difference", Finding(contact))
-        | quantity("height_difference", Finding(1e3 * height))
-    )
+    findings = {"simulation_time": 1e6 * cost / duration, "contact_difference": contact}
+    findings["height_difference"] = 1e3 * height
+    return quantities_of({name: Finding(value) for name, value in findings.items()})
 
 
 def with_tier(config: RunConfig, tier: str) -> RunConfig:
@@ -93,11 +91,9 @@ class Scene(NamedTuple):
     def describe(self) -> str:
         """The statistics as a sentence."""
         pace = f" at {self.rate:.3g} Hz, {self.usual * self.rate:.3g} m/s" if self.rate else ""
-        return (
-            f"{self.name}: {self.cycles} cycles{pace}; odometry spans {self.span[0]:.3g} x "
-            f"{self.span[1]:.3g} m, {self.usual:.2g} m a cycle (95 %: {self.most:.2g}), turns up to "
-            f"{self.turn:.2g} rad (95 %)"
-        )
+        moves = f"{self.usual:.2g} m a cycle (95 %: {self.most:.2g}), turns up to {self.turn:.2g} rad (95 %)"
+        spans = f"{self.span[0]:.3g} x {self.span[1]:.3g} m"
+        return f"{self.name}: {self.cycles} cycles{pace}; odometry spans {spans}, {moves}"
 
 
 def scene_of(source: Source) -> Scene:

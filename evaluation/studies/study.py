@@ -181,12 +181,8 @@ class StudyPlan(Settings):
 Model = TypeVar("Model", bound=BaseModel)
 Preset = TypeVar("Preset", bound=Settings)
 MOST = 100_000  # largest number of jobs of a study
-SEEDS = {
-    "simulation": "simulation.seed",
-    "create_simulation": "create_simulation.seed",
-    "rat_simulation": "rat_simulation.seed",
-    "recording": "session.seed",
-}
+SEEDS = {part: f"{part}.seed" for part in ("simulation", "create_simulation", "rat_simulation")}
+SEEDS |= {"recording": "session.seed"}
 """Key path that `seeds` sets, by kind of source."""
 
 
@@ -262,10 +258,8 @@ def check_study(name: str, document: Document, folder: Path, overrides: Sequence
 
 def searched_jobs(study: Study, parameters: dict[str, Any]) -> list[Job]:
     """The runs of the study's base with parameters by key path; an `InputError` if they are contradictory."""
-    settings: list[_Setting] = [
-        (key, value, ("tune", "parameters", key)) for key, value in parameters.items()
-    ]
-    return list(_runs_of(study, settings, "tune", _RowPlan(), parameters))
+    found: list[_Setting] = [(key, value, ("tune", "parameters", key)) for key, value in parameters.items()]
+    return list(_runs_of(study, found, "tune", _RowPlan(), parameters))
 
 
 def _jobs(study: Study) -> Iterator[Job]:
@@ -274,10 +268,9 @@ def _jobs(study: Study) -> Iterator[Job]:
     total = copies * prod(map(len, plan.vary.values())) * len(plan.every_seed())
     if total > MOST:
         raise InputError(study.document.at_key(()), f"{total} jobs", f"at most {MOST}", "vary less at a time")
-    alternatives: list[list[_Setting]] = [
-        [(key, value, ("vary", key, k)) for k, value in enumerate(values)]
-        for key, values in plan.vary.items()
-    ]
+    alternatives: list[list[_Setting]] = []
+    for key, values in plan.vary.items():
+        alternatives.append([(key, value, ("vary", key, k)) for k, value in enumerate(values)])
     wrong: dict[str, InputError] = {}
     for name, row in rows.items():
         keys = _outermost_first(row.settings)
@@ -327,10 +320,8 @@ def _put(document: Document, setting: _Setting, study: Document) -> Document:
     places = {each: place for each, place in document.places.items() if each[: len(path)] != path}
     for length in range(1, len(path)):
         places.setdefault(path[:length], here)
-    inside = {
-        (*path, *each[len(at) :]): place for each, place in study.places.items() if each[: len(at)] == at
-    }
-    return Document(data, places | inside | {path: here})
+    own = {(*path, *each[len(at) :]): place for each, place in study.places.items() if each[: len(at)] == at}
+    return Document(data, places | own | {path: here})
 
 
 def _without_index(at: KeyPath) -> KeyPath:

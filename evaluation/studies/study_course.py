@@ -30,13 +30,12 @@ class StudyCourse(NamedTuple):
     """The course of T steps, and what its statistics need.
 
     Attributes:
-        name: of the source. config: of the network. course: input of the networks. expected: [T, 3] poses
-            that the packet would have without drift, cells, not wrapped. bin: [T] flat place bin y * W + x
-            of the true position. seconds: [T] duration of each step. x_edges: [W + 1] m. y_edges: [H + 1] m.
-            chosen: [C] cells of the flattened network whose rate maps are made.
+        config: of the network. course: input of the networks. expected: [T, 3] poses that the packet would
+            have without drift, cells, not wrapped. bin: [T] flat place bin y * W + x of the true position.
+            seconds: [T] duration of each step. x_edges: [W + 1] m. y_edges: [H + 1] m. chosen: [C] cells of
+            the flattened network whose rate maps are made.
     """
 
-    name: str
     config: NetworkConfig
     course: CellCourse
     expected: np.ndarray
@@ -76,10 +75,8 @@ def read_course(
     noise = stream(seed, "cells.noise").standard_normal((len(expected), 2))
     noise[:, 1] *= np.sqrt(seconds)
     newest = np.maximum.accumulate(np.r_[-1, template])
-    course = CellCourse(
-        motion, noise, np.maximum(template, 0), template > newest[:-1],
-        relative / units(network, np.dtype(float))[2], energy,
-    )  # fmt: skip
+    novel, turned = template > newest[:-1], relative / units(network, np.dtype(float))[2]
+    course = CellCourse(motion, noise, np.maximum(template, 0), novel, turned, energy)
     # Flat bins in the smallest square round the path.
     low, high = truth[:, :2].min(axis=0), truth[:, :2].max(axis=0)
     side, middle = (high - low).max(), (low + high) / 2
@@ -94,7 +91,7 @@ def read_course(
     most = network.cells_heading * network.cells_xy**2
     if cells.max() >= most:
         raise InputError("chosen", str(cells.max()), f"indices below {most}, the cells of the network")
-    return StudyCourse(name, network, course, expected, bin, seconds, edges[0], edges[1], cells)
+    return StudyCourse(network, course, expected, bin, seconds, edges[0], edges[1], cells)
 
 
 def _read_session(
@@ -111,9 +108,8 @@ def _read_session(
 
     if views:
         seen = [step.evidence for step in build_session(config, source).replay(observations())]
-        template, relative, energy = (
-            np.array([getattr(each, name) for each in seen]) for name in ("template", "relative", "energy")
-        )
+        names = "template", "relative", "energy"
+        template, relative, energy = (np.array([getattr(each, name) for each in seen]) for name in names)
     else:
         template = np.full(sum(1 for _ in observations()), -1, np.int32)
         relative = energy = np.zeros(len(template))

@@ -81,17 +81,6 @@ def plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _summarise(records: Sequence[RunRecord], odometry: bool = False) -> list[_Row]:
-    """A row for each name and combination, in their order; last that of raw odometry if asked for."""
-    groups: dict[str, list[RunRecord]] = {}
-    for record in records:
-        groups.setdefault(json.dumps([record.row, record.varied]), []).append(record)
-    rows = [_row(group) for group in groups.values()]
-    if odometry and groups:
-        rows.append(_row(next(iter(groups.values())), odometry=True))
-    return rows
-
-
 def _mark_optimal(rows: Sequence[_Row], objectives: Mapping[str, Direction], statistic: str) -> list[_Row]:
     """The rows with `optimal` set by the mean or median of each objective.
 
@@ -123,18 +112,14 @@ def _row(group: Sequence[RunRecord], odometry: bool = False) -> _Row:
     fine = [record for record in group if record.error is None]
     names = dict.fromkeys([metric.name for metric in MEASURED])
     names |= dict.fromkeys(each for record in fine for each in record.quantities)
-    spreads = {
-        each: spread([run.odometry(each) if odometry else run.value(each) for run in fine], each)
-        for each in names
-    }
-    return _Row(
-        row=DEAD_RECKONING if odometry else group[0].row,
-        varied={} if odometry else group[0].varied,
-        runs=len(fine),
-        failed=0 if odometry else len(group) - len(fine),
-        steps=statistics.median([record.steps for record in fine]) if fine else 0.0,
-        spreads={each: found for each, found in spreads.items() if found is not None},
-    )
+    value = RunRecord.odometry if odometry else RunRecord.value
+    spreads = {each: spread([value(run, each) for run in fine], each) for each in names}
+    row, varied, failed = group[0].row, group[0].varied, len(group) - len(fine)
+    if odometry:
+        row, varied, failed = DEAD_RECKONING, {}, 0
+    steps = statistics.median([record.steps for record in fine]) if fine else 0.0
+    known = {each: found for each, found in spreads.items() if found is not None}
+    return _Row(row, varied, len(fine), failed, steps, known)
 
 
 _TALL, _EACH, _BOTTOM = 4.4, 0.13, 0.95  # inches: height of the axes, extra per point beyond 12, below
@@ -321,7 +306,12 @@ def make_report(
             whether the records are of the trials of a search; then the Pareto-optimal ones are marked.
     """
     kind = "search" if search else plan.report
-    rows = _summarise(records, odometry=kind in ("medians", "differences"))
+    groups: dict[str, list[RunRecord]] = {}
+    for record in records:
+        groups.setdefault(json.dumps([record.row, record.varied]), []).append(record)
+    rows = [_row(group) for group in groups.values()]
+    if groups and kind in ("medians", "differences"):
+        rows.append(_row(next(iter(groups.values())), odometry=True))
     if kind != "pareto":
         error = None
     elif error is None:  # the first default error that most rows have in all of their runs
@@ -399,13 +389,9 @@ def save_report(report: _Report, directory: Path) -> list[Path]:
         for name, found in row.spreads.items():
             cells |= {f"{name}_{part}": value for part, value in asdict(found).items() if part != "values"}
         lines.append(cells)
-    files = {
-        "table.csv": csv_text(lines),
-        "table.json": json.dumps(asdict(report), indent=1, allow_nan=False) + "\n",
-        "table.md": f"{render(report)}\n",
-        "pareto.png": figure,
-    }
-    return save_files(directory, files)
+    content, table = json.dumps(asdict(report), indent=1, allow_nan=False), csv_text(lines)
+    files = {"table.csv": table, "table.json": f"{content}\n", "table.md": f"{render(report)}\n"}
+    return save_files(directory, files | {"pareto.png": figure})
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -496,9 +482,8 @@ def find_disturbances(machines: Sequence[Machine]) -> list[str]:
     if len(builds) > 1:
         found.append(f"the records are of {len(builds)} builds of ratslam; delete them to run all again")
     if len(processors) > 1 or max((each.workers for each in machines), default=1) > 1:
-        found.append(
-            "several runs at a time, or several machines, disturb times: measure speed with --workers 1"
-        )
+        causes = "several runs at a time, or several machines, disturb times"
+        found.append(f"{causes}: measure speed with --workers 1")
     load = max((each.other_load or 0.0 for each in machines if each.workers == 1), default=0.0)
     if load > DISTURBED:
         found.append(f"other processes kept up to {load:.1f} cores busy meanwhile, which lengthens times")

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.energy_metric import energy, energy_all_pairs, successive_pairs
+from evaluation.metrics.energy_metric import energy, energy_all_pairs
 from evaluation.metrics.exm import experience_metric
 from evaluation.metrics.statistics import bootstrap
-from evaluation.metrics.trajectory import align
+from evaluation.metrics.trajectory import align, successive_pairs
 from evaluation.papers import paper_sets
 from evaluation.papers.paper_sets import Paper, ResultRow, column, run_with_progress
 from evaluation.papers.salman2016 import paper_figures, protocols

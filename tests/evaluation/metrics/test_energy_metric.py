@@ -15,8 +15,8 @@ from evaluation.metrics.energy_metric import (
     energy_all_pairs,
     read_relations,
     relation_errors,
-    successive_pairs,
 )
+from evaluation.metrics.trajectory import successive_pairs
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose
 

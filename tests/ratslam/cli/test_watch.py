@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -303,7 +304,7 @@ def test_the_status_line_shows_steps_distance_pace_and_outcomes():
     way = np.array([[0.0, 1.0, 0.0], [0.0, 2.0, 1.0], [3.0, 2.0, 2.0], [3.0, 2.0, 3.0]])
     seen = RunProgress(
         "name", RUNNING, 9, np.zeros((4, 3)), np.zeros(3), way, nothing,
-        outcomes={"ok": 1, "reseeded": 3}, lost=2, online_error=0.5, checkpoint=2, rate=None, silence=11.0,
+        outcomes=Counter(ok=1, reseeded=3), lost=2, online_error=0.5, checkpoint=2, rate=None, silence=11.0,
     )  # fmt: skip
     assert seen.status_line(8.2) == (
         "name: running, 4 of 9 steps, 5.0 m, 8 steps/s, error 0.5 m, 3 reseeded, 1 ok, 2 lost, "
