@@ -143,7 +143,8 @@ class ExperienceMap(Checkpointed, Map):
 
     def edges(self) -> Edges:
         """All links: ends, motion and information."""
-        return Edges(*self._ends.rows.T.copy(), self._motion.rows.copy(), self._information.rows.copy())
+        i, j = self._ends.rows.T.copy()
+        return Edges(i, j, self._motion.rows.copy(), self._information.rows.copy())
 
     def trajectory(self) -> np.ndarray:
         """[T, 3] poses of all steps: present pose of the step's node, and the motion since; the odometry to

@@ -34,7 +34,7 @@ from ratslam.network.config import Network, PoseCellConfig
 from ratslam.network.pose_cells import SUPPORT, Belief
 from ratslam.recall import filter
 from ratslam.recall.config import RecallConfig
-from ratslam.recall.memory import MapFeedback, frozen_memory
+from ratslam.recall.memory import MapFeedback, init_memory
 from ratslam.recall.observation_model import SAMPLES, ObservationLikelihood
 from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
@@ -239,7 +239,7 @@ def _compiled(
     def run(poses: Array, motion: Array, likelihood: Array, novelty: Array, start: Array) -> Any:
         views, labels = np.zeros((rows, 1)), np.full(rows, -1, np.int32)
         feedback = MapFeedback(np.zeros((rows, 3)), 0.0, 0.0, 0.0, 0.0, 1.0)
-        memory = frozen_memory(config, feedback, views, labels, rows, dtype, 0)
+        memory = init_memory(config, views.shape[1], rows, dtype, 0).filled(feedback, views, labels)
         x, y, heading = jnp.concatenate([poses, poses[-1:]]).T
         memory = memory._replace(
             x=x, y=y, heading=heading, cosine=jnp.cos(heading), sine=jnp.sin(heading), pose=poses[-1]
