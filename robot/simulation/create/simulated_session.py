@@ -184,7 +184,11 @@ def make_report(config: CreateSimulationConfig, step: _CreateStep, odometry: Odo
 
 
 def train_strain_templates(config: CreateSimulationConfig) -> StrainTemplates:
-    """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G)."""
+    """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G).
+
+    Raises:
+        InputError: the training has another sample rate than the whiskers.
+    """
     training = TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
     random = stream(config.seed, "templates")
     each = product(training.angles.tolist(), range(training.repeats))
