@@ -60,7 +60,7 @@ def recommend(config: RunConfig, scene: Scene) -> list[_Recommendation]:
     return [*own, *_tier(config)]
 
 
-def _round_number(value: float, side: int = 0, steps: tuple[int, ...] = (1, 2, 5)) -> float:
+def round_number(value: float, side: int = 0, steps: tuple[int, ...] = (1, 2, 5)) -> float:
     """The nearest of some steps times a power of ten; not below the value if side is 1, not above if -1."""
     power = np.floor(np.log10(value))
     every = [float(f"{step}e{power + k:.0f}") for k in (-1, 0, 1) for step in steps]
@@ -111,9 +111,9 @@ def _cell_size(config: RunConfig, scene: Scene) -> _Recommendation:
     steps = f"{_parts(most)} sub-steps of {LARGEST_SUBSTEP:g} at most"
     value, why = now, f"a cycle moves {moved:.2g} cells (95 %: {most:.2g}): {steps}"
     if _parts(most) > PARTS:
-        value, why = _round_number(scene.most / (LARGEST_SUBSTEP * PARTS), 1), f"{why}, where {PARTS} will do"
+        value, why = round_number(scene.most / (LARGEST_SUBSTEP * PARTS), 1), f"{why}, where {PARTS} will do"
     elif moved < SLOW:
-        value, why = _round_number(scene.usual / SLOW, -1), f"{why}, {1 / moved:.0f} cycles for one cell"
+        value, why = round_number(scene.usual / SLOW, -1), f"{why}, {1 / moved:.0f} cycles for one cell"
     return _of(config, "pose_cells.cell_size", value, why)
 
 
@@ -143,7 +143,7 @@ def _engine(config: RunConfig, proposed: NetworkConfig) -> _Recommendation:
 
 def _grid(config: RunConfig, scene: Scene) -> Iterator[_Recommendation]:
     grid, side = config.grid, config.grid.side or LIVE_SIDE
-    blob, cell = grid.footprint.blob_sd, _round_number(grid.footprint.blob_sd)
+    blob, cell = grid.footprint.blob_sd, round_number(grid.footprint.blob_sd)
     across = int(np.ceil(side / cell))
     # Standard deviation of odometry after crossing the scene, by the filter's drift model.
     span, drift = max(scene.span), grid.drift
@@ -151,7 +151,7 @@ def _grid(config: RunConfig, scene: Scene) -> Iterator[_Recommendation]:
     along = span * np.hypot(np.hypot(drift.session, drift.move), drift.step / np.sqrt(cycles))
     aside = span * drift.heading * np.sqrt(cycles / 3)
     off = float(np.hypot(along, aside)) / cell
-    wanted = int(np.clip(_round_number(max(PER_CELL * off, 1.0), steps=(1, 2, 3, 5)), *PARTICLES))
+    wanted = int(np.clip(round_number(max(PER_CELL * off, 1.0), steps=(1, 2, 3, 5)), *PARTICLES))
     each = LAYERS * across**2 * np.dtype(np.float32).itemsize / 2**20
     count = min(wanted, max(PARTICLES[0], int(MEMORY / each)))
     yield _of(config, "grid.cell", cell, f"as fine as the mark of a contact, {blob:g} m")

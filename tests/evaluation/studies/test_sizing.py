@@ -21,6 +21,7 @@ from evaluation.studies.recommendation import (
     changed_settings_yaml,
     cheaper_steps,
     recommend,
+    round_number,
 )
 from evaluation.studies.run_job import RunRecord
 from evaluation.studies.scene_statistics import Scene, scene_of, short_session, with_tier
@@ -60,6 +61,14 @@ CONFIGS = st.builds(
     st.sampled_from(["auto", "quasistatic", "dynamic"]),
     st.sampled_from([3.0, 30.0]),
 )  # fmt: skip
+
+
+@given(LENGTHS, st.sampled_from([-1, 0, 1]))
+def test_nice_numbers_are_near_and_on_the_side_asked_for(value, side):
+    found = round_number(value, side)
+    assert value / 2.5 <= found <= value * 2.5
+    assert (found - value) * side >= 0
+    assert round_number(found, side) == found
 
 
 @given(CONFIGS, scenes())
