@@ -112,7 +112,7 @@ def write_page(path: Path, runs: Sequence[PageRun], citation: str) -> None:
         comparison=[_comparison_row(report) for report in reports] if len(runs) > 1 else None,
         columns=_COLUMNS,
         compared_charts=list(compared),
-        citations=read_citations(citation),
+        citations=_read_citations(citation),
         citation=citation,
     )
     write_atomically(path, lambda temporary: temporary.write_bytes(page.encode()))
@@ -145,7 +145,7 @@ def _run_context(number: int, run: PageRun, charts: dict[str, Any]) -> dict[str,
     }
 
 
-def read_citations(text: str) -> list[str]:
+def _read_citations(text: str) -> list[str]:
     """The program and its references, a line each: authors, year, title, place, identifier.
 
     Args:

@@ -165,7 +165,7 @@ def draw_pareto(title: str, line: str, marks: Sequence[ParetoPoint], time: str, 
     return figure
 
 
-def place_labels(
+def _place_labels(
     size: np.ndarray, anchor: np.ndarray, area: np.ndarray, blocked: np.ndarray, crossed: np.ndarray
 ) -> np.ndarray:
     """Places labels one after the other, each at the free position nearest to its anchor.
@@ -264,7 +264,7 @@ def _label(axes: style.Axes, names: Sequence[str], spans: np.ndarray, best: np.n
     bars = np.concatenate([across, up])
     order = np.lexsort((at[:, 0], ~best))
     frame = np.array(axes.get_window_extent().extents)
-    corners = place_labels(sizes[order], at[order], frame, blocked, bars)
+    corners = _place_labels(sizes[order], at[order], frame, blocked, bars)
     for k, corner in zip(order, corners, strict=True):
         texts[k].xyann = tuple(corner - [boxes[k].x0, boxes[k].y0])
         near = np.clip(at[k], corner, corner + sizes[k])

@@ -88,7 +88,7 @@ def point_activity(levels: Levels, pose: Array) -> Activity:
 
 def to_full_torus(levels: Levels, activity: Activity) -> Array:
     """[K, N, N] the activity of the whole torus."""
-    return block_at(levels, len(levels) - 1, activity, jnp.zeros(3, jnp.int32)).activity[0]
+    return _block_at(levels, len(levels) - 1, activity, jnp.zeros(3, jnp.int32)).activity[0]
 
 
 def activity_sums(levels: Levels, activity: Activity) -> PoseCellActivity:
@@ -104,7 +104,7 @@ def activity_sums(levels: Levels, activity: Activity) -> PoseCellActivity:
     return PoseCellActivity(xy, heading)
 
 
-def block_at(levels: Levels, k: int, activity: Activity, origin: Array) -> Block:
+def _block_at(levels: Levels, k: int, activity: Activity, origin: Array) -> Block:
     """The activity at level k, from whichever level up to k holds it; a new window begins at `origin` [3]."""
 
     def transfer_from(j: int) -> Callable[[], Block]:
@@ -346,7 +346,7 @@ def _attempt(levels: Levels, k: int, smallest: Block, held: Array, inputs: StepI
     _, now, _ = carry
     level, last = levels[k], k == len(levels) - 1
     before = Activity((smallest, *now.blocks[1:]), held)
-    source = block_at(levels, k, before, level.window.origin_centred_on(_middle(levels, before, inputs)))
+    source = _block_at(levels, k, before, level.window.origin_centred_on(_middle(levels, before, inputs)))
     block, result, exact = step_at(level, source, inputs)
     total = jnp.stack([jnp.sum(block.activity) for block in before.blocks])[held]
     exact = (exact & _equal_sums(total, jnp.sum(source.activity))) | last

@@ -135,8 +135,8 @@ def _diff(arguments: argparse.Namespace) -> None:
 def _undo(arguments: argparse.Namespace) -> None:
     output: Path | None = arguments.output
     prepare_jax()
-    from ratslam.runs.folder_change import finish_change
     from ratslam.runs.map_care import replaced_file, undo_sequence
+    from tactile.base.files import finish_change
 
     if output is None:
         output = arguments.map = replaced_file(arguments.map)

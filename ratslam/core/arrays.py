@@ -157,10 +157,12 @@ class Checkpointed:
     Attributes:
         VALUES: names of attributes that are numbers, NumPy arrays, or tuples of these.
         PARTS: names of attributes that are `Checkpointed` or None.
+        FLAT: those of `PARTS` whose arrays keep their own names.
     """
 
     VALUES: ClassVar[tuple[str, ...]] = ()
     PARTS: ClassVar[tuple[str, ...]] = ()
+    FLAT: ClassVar[tuple[str, ...]] = ()
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Copies of the whole state, by attribute name without a leading underscore."""
@@ -169,8 +171,8 @@ class Checkpointed:
             for k, value in enumerate(_as_tuple(getattr(self, name))):
                 arrays[f"{name.lstrip('_')}/{k}"] = np.array(value)
         for name in self._parts():
-            part = getattr(self, name).arrays()
-            arrays |= {f"{name.lstrip('_')}/{key}": value for key, value in part.items()}
+            part, prefix = getattr(self, name).arrays(), self._prefix(name)
+            arrays |= {prefix + key: value for key, value in part.items()}
         return arrays
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -198,7 +200,7 @@ class Checkpointed:
             else:
                 setattr(self, name, type(before)(*values) if hasattr(before, "_fields") else tuple(values))
         for name in self._parts():
-            getattr(self, name).restore(with_prefix(arrays, f"{name.lstrip('_')}/"))
+            getattr(self, name).restore(with_prefix(arrays, self._prefix(name)))
 
     def _append_row(self, *values: Any) -> None:
         """Appends a row to every growable array, whose values come in the order in which these were made."""
@@ -213,6 +215,9 @@ class Checkpointed:
     def _growable_arrays(self) -> dict[str, GrowableArray]:
         found = vars(self).items()
         return {name.lstrip("_"): value for name, value in found if isinstance(value, GrowableArray)}
+
+    def _prefix(self, part: str) -> str:
+        return "" if part in self.FLAT else f"{part.lstrip('_')}/"
 
     def _parts(self) -> list[str]:
         return [name for name in self.PARTS if getattr(self, name) is not None]

@@ -78,10 +78,10 @@ def contact_map(made: Map, image: ImageConfig, head: Head) -> RememberedContacts
 
 def _keyframe_contacts(made: Map, image: ImageConfig, head: Head) -> tuple[np.ndarray, list[np.ndarray]]:
     """Poses [n, 3] of the keyframes, and the contacts [m, 2] of each in base_link, m."""
-    if not isinstance(made, KeyframeMap) or not isinstance(made.keyframes().appearance, WhiskerAppearance):
+    if not isinstance(made, KeyframeMap) or not isinstance(made.appearance, WhiskerAppearance):
         return np.zeros((0, 3)), []
-    poses = made.solution().fit.poses
-    levels, _ = made.keyframes().appearance.stored(np.arange(len(poses)))
+    poses = made.solution().pose.rows
+    levels, _ = made.appearance.stored(np.arange(len(poses)))
     if levels.shape[1] < len(head.length):
         return np.zeros((0, 3)), []
     points, there = image_points(head, level_heights(levels[:, : len(head.length)]), image.tallest)

@@ -1,1 +1,1 @@
-"""The map of keyframes: loop closures, their verification and selection, and its optimisation."""
+"""The map of keyframes: its state (`map_state`), loop closures, their selection, and the solver."""

@@ -14,63 +14,72 @@ biases and turn errors with which odometry leads to its place, a false one none 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.special import expit
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
-from ratslam.mapping.archive import Archive
 from ratslam.mapping.closure_judge import AT_ONCE, judge_sequences
-from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.loop_closures import CONFIRMED_WEIGHT, Candidate, ClosureLog, Verdict
-from ratslam.mapping.map_solution import MapSolution, cheapest_map
+from ratslam.mapping.ground import LearnedOdds
+from ratslam.mapping.loop_closures import CONFIRMED_WEIGHT, Candidate, Verdict
+from ratslam.mapping.map_solution import cheapest_map
+from ratslam.mapping.map_state import MapState
 from ratslam.mapping.odometry_scan import OdometryScan
 from ratslam.mapping.optimizer import CalibrationPrior
-from ratslam.mapping.verification import break_odometry, judge_by_map, map_distance, spans
+from ratslam.mapping.verification import (
+    SEARCH,
+    find_turning_point,
+    judge_by_map,
+    map_distance,
+    spans,
+    turn_on_spot,
+)
+from tactile.base.se2 import compose, inverse
 
 
 class Acceptance(Checkpointed, ABC):
     """A rule with what it has learned."""
 
-    def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> None:
+    def learn_bias(self, state: MapState, prior: CalibrationPrior) -> None:
         """Takes over the prior with the heading bias that the views show."""
-        graph.adopt_prior(log, prior)
+        state.adopt_prior(prior)
 
     @abstractmethod
-    def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
+    def judge(self, state: MapState, sequence: int, candidate: Candidate) -> bool:
         """Judges after `candidate` was added to `sequence`; whether any sequence was accepted."""
 
-    def review(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
+    def review(self, state: MapState) -> bool:
         """Judges again after the map has changed; whether any sequence was accepted."""
         return False
 
-    def solution(self, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
-        """The map as it would be if the session ended now; leaves graph and log unchanged."""
-        return MapSolution.solved(graph, log)
+    def solution(self, state: MapState) -> MapState:
+        """The map as it would be if the session ended now; leaves `state` unchanged."""
+        return state.solved()
 
 
 class AcceptByEvidence(Acceptance):
     """A sequence is accepted by its evidence less what the map's covariance says against it; where
     sequences are selected later, only if it is likely to be true."""
 
-    def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
-        config, score, length = graph.config, log.score(sequence), len(log.members(sequence))
-        piece = graph.pieces(log)
+    def judge(self, state: MapState, sequence: int, candidate: Candidate) -> bool:
+        config, log, piece = state.config, state.log, state.pieces()
+        score, length = log.score(sequence), len(log.members(sequence))
         if log.verdict(sequence) != Verdict.OPEN or piece[candidate.keyframe] != piece[candidate.match]:
             return False
         if length < config.min_length or score < config.min_score:
             return False
-        distance = map_distance(graph, log, candidate) if graph.ablation.verify else 0.0
+        distance = map_distance(state, candidate) if state.ablation.verify else 0.0
         fits = distance < config.max_distance and score - distance / 2 >= config.min_score
         accepted = fits
         if fits and config.select_every:  # an unlikely sequence waits for the next selection
-            (odds,) = judge_sequences(graph, graph.fit(), log, graph.cut, np.array([sequence]))
+            (odds,) = judge_sequences(state, np.array([sequence]))
             accepted = not odds < AT_ONCE
         log.judge(sequence, Verdict.ACCEPTED if accepted else Verdict.OPEN, distance)
         carried = config.may_be_carried and not config.select_every  # selection places its own cuts
         broken = carried and length >= config.break_length and score >= config.break_score
         if not fits and broken and distance >= config.max_distance:
-            break_odometry(graph, log, sequence)
+            _break_odometry(state, sequence)
         return log.verdict(sequence) == Verdict.ACCEPTED
 
 
@@ -147,125 +156,126 @@ calibration (`vote`)."""
 
 
 class AcceptByOdds(Acceptance):
-    """Judges all open sequences. Odometry is compared on the keyframes as they were taken, of `archive`
-    once some are merged."""
+    """Judges all open sequences. Odometry is compared on the keyframes as they were taken."""
 
     VALUES = ("_views_prior",)
 
-    def __init__(self, graph: KeyframeGraph, archive: Archive) -> None:
-        self._archive, self._scan = archive, OdometryScan(graph)
+    def __init__(self, state: MapState) -> None:
+        self._scan = OdometryScan(state)
         self._log_ratio = GrowableArray((len(self._scan.grid),), np.float64)  # by calibration
-        self._views_prior = graph.prior
+        self._views_prior = state.prior
 
-    def learn_bias(self, graph: KeyframeGraph, log: ClosureLog, prior: CalibrationPrior) -> None:
+    def learn_bias(self, state: MapState, prior: CalibrationPrior) -> None:
         self._views_prior = prior
         # Sequences whose comparison does not cover the present prior are compared again.
         ratios = self._log_ratio.rows
         uncovered = np.isnan(ratios[:, self._scan.near(self._views_prior)]).any(axis=1)
         for sequence in np.flatnonzero(uncovered & np.isfinite(ratios).any(axis=1)).tolist():
-            self._rate(graph, log, sequence)
-        graph.adopt_prior(log, self._vote(graph, log)[2])
+            self._rate(state, sequence)
+        state.adopt_prior(self._vote(state)[2])
 
-    def judge(self, graph: KeyframeGraph, log: ClosureLog, sequence: int, candidate: Candidate) -> bool:
+    def judge(self, state: MapState, sequence: int, candidate: Candidate) -> bool:
+        log = state.log
         while len(self._log_ratio.rows) < log.sequences:
             self._log_ratio.append(np.full(len(self._scan.grid), np.nan))
         length, accepted = int(log.sizes()[sequence]), log.verdict(sequence) == Verdict.ACCEPTED
-        if length < graph.config.min_length:
+        if length < state.config.min_length:
             return False
         # The middle of a growing sequence moves on slowly: it is compared anew only at lengths of at most
         # three significant bits.
         rest = max(length.bit_length() - 3, 0)
-        if length == length >> rest << rest or length == graph.config.min_length:
-            self._rate(graph, log, sequence)
+        if length == length >> rest << rest or length == state.config.min_length:
+            self._rate(state, sequence)
         due = candidate.keyframe % REVIEW_EVERY == 0
         if accepted and not due:
             return False
-        voted = self._vote(graph, log)
-        graph.adopt_prior(log, voted[2])
+        voted = self._vote(state)
+        state.adopt_prior(voted[2])
         among = np.arange(log.sequences) if due else np.array([sequence])
-        return self._accept(graph, log, among, voted) or self._break(graph, log, sequence)
+        return self._accept(state, among, voted) or self._break(state, sequence)
 
-    def review(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
-        return self._accept(graph, log, np.arange(log.sequences), self._vote(graph, log))
+    def review(self, state: MapState) -> bool:
+        return self._accept(state, np.arange(state.log.sequences), self._vote(state))
 
-    def solution(self, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
-        graph, log = graph.copy(), log.copy()
-        sequences, _, belief, mean, _ = self._vote(graph, log)
+    def solution(self, state: MapState) -> MapState:
+        trial, found = state.copy(), state.trial()
+        sequences, _, belief, mean, _ = self._vote(trial)
         if len(sequences):
-            graph.prior = belief
+            trial.prior = belief
             for _ in range(REVIEWS):
-                if not self.review(graph, log):
+                if not self.review(trial):
                     break
-                graph.optimise(log)
-        if not len(log.accepted_rows()):
-            return MapSolution.solved(graph, log)
-        return cheapest_map(graph, log, [mean, graph.prior])
+                trial.optimise()
+        solved = cheapest_map(trial, [mean, trial.prior]) if len(trial.log.accepted_rows()) else trial
+        found.take_fit(solved.fit())
+        found.log, found.cut = solved.log, solved.cut
+        return found
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self._scan.clear()
 
-    def _vote(self, graph: KeyframeGraph, log: ClosureLog) -> _Vote:
-        near = self._scan.near(self._views_prior)
+    def _vote(self, state: MapState) -> _Vote:
+        log, near = state.log, self._scan.near(self._views_prior)
         known = np.isfinite(self._log_ratio.rows[:, near]).all(axis=1)
         sequences = np.flatnonzero(known & (log.verdicts()[: len(known)] != Verdict.UNDONE))
         confirmed = (log.verdicts() == Verdict.ACCEPTED) & (log.sequence_weights() > CONFIRMED_WEIGHT)
         false = 1 - expit(np.nan_to_num(log.log_odds(), nan=-np.inf))
-        null = estimate_null(log.scores(), false, graph.count)
+        null = estimate_null(log.scores(), false, state.count)
         score_odds = log_odds(log.scores(), *null, float(confirmed.sum()))[sequences]
-        least = graph.config.bias_least / graph.cell
+        least = state.config.bias_least / state.cell
         grid, ratios = self._scan.grid[near], self._log_ratio.rows[sequences][:, near]
         return sequences, score_odds, *vote(grid, self._views_prior, ratios, score_odds, least)
 
-    def _accept(self, graph: KeyframeGraph, log: ClosureLog, among: np.ndarray, voted: _Vote) -> bool:
+    def _accept(self, state: MapState, among: np.ndarray, voted: _Vote) -> bool:
         """Accepts every open sequence of `among` whose odds, by raw odometry or by the map, are high
         enough; whether there was any."""
-        sequences, score_odds, _, _, odds = voted
+        log, (sequences, score_odds, _, _, odds) = state.log, voted
         open_ = (log.verdicts()[sequences] == Verdict.OPEN) & np.isin(sequences, among)
-        open_ &= ((log.left() > 0) & ~spans(graph.pieces(log), log))[sequences]
+        open_ &= ((log.left() > 0) & ~spans(state.pieces(), log))[sequences]
         # No odometry prior at the start of a piece: only the map judges there.
-        accepted = (odds >= MIN_LOG_ODDS) & ~spans(np.cumsum(graph.begins.rows), log)[sequences]
-        undecided = open_ & ~accepted & (score_odds + np.log(graph.count) > 0)
-        doubtful = open_ & accepted & graph.config.may_be_carried
+        accepted = (odds >= MIN_LOG_ODDS) & ~spans(np.cumsum(state.begins.rows), log)[sequences]
+        undecided = open_ & ~accepted & (score_odds + np.log(state.count) > 0)
+        doubtful = open_ & accepted & state.config.may_be_carried
         if (undecided | doubtful).any():
-            covariance = graph.map_covariance(log)
+            covariance = state.covariance()
             for k in np.flatnonzero(undecided | doubtful).tolist():
                 member = log.members(int(sequences[k]))[-1]
-                log_ratio, distance, position_sd, heading_sd = judge_by_map(graph, covariance, member)
+                log_ratio, distance, position_sd, heading_sd = judge_by_map(state, covariance, member)
                 if undecided[k] and heading_sd <= LINEAR_HEADING:
                     by_map = score_odds[k] + log_ratio
-                    near = position_sd < NEAR * graph.cell
+                    near = position_sd < NEAR * state.cell
                     odds[k] = max(odds[k], by_map)
                     accepted[k] = odds[k] >= MIN_LOG_ODDS or (near and by_map >= 0)
-                if graph.config.may_be_carried:  # no evidence is too much for a sequence after a cut
-                    accepted[k] &= distance < graph.config.max_distance
+                if state.config.may_be_carried:  # no evidence is too much for a sequence after a cut
+                    accepted[k] &= distance < state.config.max_distance
         log.raise_log_odds(sequences, odds)
         for sequence in sequences[open_ & accepted].tolist():
             log.judge(sequence, Verdict.ACCEPTED)
         return bool((open_ & accepted).any())
 
-    def _break(self, graph: KeyframeGraph, log: ClosureLog, sequence: int) -> bool:
+    def _break(self, state: MapState, sequence: int) -> bool:
         """Cuts the odometry where a long sequence contradicts it, if the robot may be carried."""
-        config = graph.config
+        config, log = state.config, state.log
         long = log.sizes()[sequence] >= config.break_length and log.score(sequence) >= config.break_score
-        apart = bool(spans(graph.pieces(log), log)[sequence])
+        apart = bool(spans(state.pieces(), log)[sequence])
         if not (config.may_be_carried and long) or apart or log.verdict(sequence) != Verdict.OPEN:
             return False
-        break_odometry(graph, log, sequence)
+        _break_odometry(state, sequence)
         for other in np.flatnonzero(np.isfinite(self._log_ratio.rows).any(axis=1)).tolist():
-            self._rate(graph, log, other)
+            self._rate(state, other)
         return True
 
-    def _rate(self, graph: KeyframeGraph, log: ClosureLog, sequence: int) -> None:
+    def _rate(self, state: MapState, sequence: int) -> None:
         """Compares a sequence, by its middle member, with raw odometry."""
-        if self._archive.begun:
-            self._archive.follow(MapSolution(graph.fit(), log, graph.cut), graph)
-            graph, log = self._archive.graph, self._archive.log
-        members = log.members(sequence)
+        if state.merged:
+            state.merged.follow(state)
+        whole = state.unmerged
+        members = whole.log.members(sequence)
         if len(members):
             near = self._scan.near(self._views_prior, WIDE)
-            self._log_ratio.rows[sequence] = self._scan.log_ratios(graph, members[len(members) // 2], near)
+            self._log_ratio.rows[sequence] = self._scan.log_ratios(whole, members[len(members) // 2], near)
 
 
 LEAST_SCORE = 2.0
@@ -304,3 +314,59 @@ def log_odds(scores: np.ndarray, number: np.ndarray, excess: np.ndarray, true_co
     """
     true = np.log(max(true_count, MIN_TRUE) / TRUE_MEAN) - scores / TRUE_MEAN
     return true - np.log(number / excess) + (scores - LEAST_SCORE) / excess
+
+
+def _break_odometry(state: MapState, sequence: int) -> None:
+    """Cuts the odometry where the views show the break, and joins the parts by the sequence."""
+    log, pose = state.log, state.pose.rows
+    members = log.members(sequence)
+    middle = members[len(members) // 2]
+    found = turn_on_spot(pose[middle[1]], -middle[2] * state.sector_angle)
+    carried = compose(found, inverse(pose[middle[0]]))
+    # The first keyframe whose views fit better at the poses moved by `carried` [3].
+    first = int(members[0, 0])
+    anchored = log.table()[log.accepted_rows(), 0]
+    began = int(np.flatnonzero(state.begins.rows[: first + 1]).max(initial=0))
+    since = max(int(anchored[anchored < first].max(initial=0)) - state.config.max_gap, began)
+    frames = np.arange(max(since, first - SEARCH, 1), first + 1)
+    at = find_turning_point(state, frames, state.pose.rows, state.pose.rows[frames], carried)
+    state.cut.rows[at] = sequence
+    pose[at:] = compose(carried, pose[at:])
+    log.reject(at, sequence)
+    log.judge(sequence, Verdict.ACCEPTED)
+
+
+TIE_EVERY = 4
+"""Keyframes between two trials of a tie of the newest piece to older keyframes."""
+YOUNG = 400
+"""Number of keyframes of a piece up to which its tie is tried: one that later views contradict is undone."""
+
+Tie = tuple[float, Sequence[Candidate]]
+"""A placement of the newest piece: its log-odds less the logarithm of the number of places (where those of
+another placement are within half of `tie_log_odds`, the difference to the largest of these), and the closures
+that it implies."""
+FindTie = Callable[[MapState, LearnedOdds], Tie | None]
+"""Finds the best placement of the keyframes since the newest beginning among those before, and keeps the
+odds that it learns for these; None without any."""
+
+
+def tie_newest_piece(state: MapState, find: FindTie, learned: LearnedOdds) -> bool:
+    """If a trial is due: ties the newest piece where the evidence suffices, or undoes its tie where the
+    views contradict it; whether the map has changed."""
+    log, starts = state.log, np.flatnonzero(state.begins.rows)
+    if state.total % TIE_EVERY or not len(starts) or state.count - starts[-1] > YOUNG:
+        return False
+    log_odds, closures = find(state, learned) or (-np.inf, ())
+    # Accepted sequences between keyframes before the newest beginning and since.
+    newest = np.arange(state.count) >= starts[-1]
+    across = np.flatnonzero(spans(newest, log) & (log.verdicts() == Verdict.ACCEPTED))
+    if not len(across):
+        if log_odds < state.config.tie_log_odds:
+            return False
+        state.add_accepted(closures)
+    elif log_odds >= state.config.tie_log_odds / 2:
+        return False
+    for sequence in across.tolist():
+        log.judge(sequence, Verdict.UNDONE)
+    state.place_pieces()
+    return True

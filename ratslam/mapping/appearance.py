@@ -205,7 +205,7 @@ class ViewAppearance(Appearance):
 
     def misfits(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """Mean absolute differences."""
-        return mean_differences(self._view.rows, np.broadcast_to(frame, len(others)), others)
+        return _mean_differences(self._view.rows, np.broadcast_to(frame, len(others)), others)
 
     def log_odds(self, frame: int | np.ndarray, others: np.ndarray, reversed: np.ndarray) -> np.ndarray:
         """1 for equal views, 0 at the scale of errors, which few different places stay below."""
@@ -307,7 +307,7 @@ class WhiskerAppearance(_LearnedAppearance):
 
 
 @compiled
-def mean_differences(views: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _mean_differences(views: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """[n] mean absolute differences of the views [N, D] numbered a [n] and b [n]."""
     found = np.empty(len(a))
     for k in range(len(a)):

@@ -16,13 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.arrays import GrowableArray
 from ratslam.core.compiled import compiled
 from ratslam.mapping.closure_selection import CUT, MapHypotheses, Selection, SelectionProblem
 from ratslam.mapping.ground import BINS, GainOdds, learn_gain_odds
-from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
-from ratslam.mapping.map_solution import MapSolution, selected_map, selection_problem, sequences_to_select
+from ratslam.mapping.map_solution import selected_map, selection_problem, sequences_to_select
+from ratslam.mapping.map_state import MapState
 from ratslam.mapping.optimizer import MapFit, MapProblem, System
 from ratslam.mapping.pose_tracks import SelfTraverse, Track
 from ratslam.mapping.verification import turn_on_spot
@@ -41,12 +40,12 @@ class _CarriedProblem(NamedTuple):
     """What is selected from once the odometry is cut.
 
     Attributes:
-        log: without the candidates that lie across a cut. sequences: [R] those to select from. problem:
-            among these. breaks: of each cut its keyframe, and the first of the sequences after it, the last
-            one if there is none.
+        state: without cuts and without the candidates that lie across one. sequences: [R] those to select
+            from. problem: among these. breaks: of each cut its keyframe, and the first of the sequences after
+            it, the last one if there is none.
     """
 
-    log: ClosureLog
+    state: MapState
     sequences: np.ndarray
     problem: SelectionProblem
     breaks: tuple[tuple[int, int], ...]
@@ -74,63 +73,60 @@ _ScoredMap = tuple[float, Selection, _CarriedProblem, _CarriedProblem]
 sequences of recall and those along the poses; and the sequences of recall alone."""
 
 
-def is_retraced(graph: KeyframeGraph) -> bool:
+def is_retraced(state: MapState) -> bool:
     """Whether the final map of these keyframes, none of them merged, is retraced: not if pieces are given."""
-    config = graph.config
-    known = FEWEST_RETRACED <= graph.count <= MOST_RETRACED and not graph.begins.rows.any()
+    config = state.config
+    known = FEWEST_RETRACED <= state.count <= MOST_RETRACED and not state.begins.rows.any()
     return bool(config.may_be_carried and config.select_every and known)
 
 
-def retraced_solution(graph: KeyframeGraph, solution: MapSolution) -> MapSolution:
-    """The map of `solution` after the robot has been retraced; the same if it has no sequences.
-
-    Args:
-        graph: keyframes, none of them merged.
-    """
-    fits, fit, log = view_fits(graph), solution.fit, solution.log
-    odds = learn_odds(SelfTraverse.of_map(graph, fit, fits))
-    first = _carried_problem(graph, log, np.flatnonzero(solution.cut.rows >= 0))
+def retraced_solution(solution: MapState) -> MapState:
+    """The map of a solution, no keyframe of it merged, after the robot has been retraced; the same if it has
+    no sequences."""
+    fits, fit, log = view_fits(solution), solution.fit(), solution.log
+    odds = learn_odds(SelfTraverse.of_map(solution, fit, fits))
+    first = _carried_problem(solution, log, np.flatnonzero(solution.cut.rows >= 0))
     if not len(first.sequences):
         return solution
-    newest = best = _score(graph, fits, odds, first, [fit])
+    newest = best = _score(fits, odds, first, [fit])
     later = np.triu(np.ones((len(fits), len(fits)), bool))
     past = np.where(later[:, None], np.float32(-np.inf), fits)  # those at earlier keyframes
     for _ in range(ROUNDS):
-        found = [_retrace(graph, fits, compared, odds, newest, log) for compared in (fits, past)]
+        found = [_retrace(fits, compared, odds, newest, log) for compared in (fits, past)]
         newest = max(found, key=itemgetter(0))
         best = max(best, newest, key=itemgetter(0))
     _, selection, case, _ = best
-    given = selected_map(graph, case.log, _uncut(graph), case.sequences, selection)
-    refused = given.log.verdicts() != Verdict.ACCEPTED
-    refused[: log.sequences] = False  # what recall says against the map stays
-    given.log.reject_sequences(np.flatnonzero(refused))
-    return given
+    return selected_map(case.state, case.sequences, selection, recalled=log.sequences)
 
 
-def kept_part(solution: MapSolution, kept: MapSolution, rows: np.ndarray) -> MapSolution:
-    """A solution of all keyframes reduced to the keyframes `rows` [n], those of the map `kept`, and, if
-    these are fewer, to its sequences."""
-    if len(rows) == len(solution.fit.poses):
+def kept_part(solution: MapState, kept: MapState) -> MapState:
+    """A solution of all keyframes reduced to the keyframes of the map `kept`, and, if these are fewer, to its
+    sequences."""
+    rows = kept.taken.rows
+    if len(rows) == solution.count:
         return solution
-    log, cut = kept.log.copy(), GrowableArray((), np.int64)
-    log.follow(solution.log)
-    cut.replace(solution.cut.rows[rows])
-    log.reject_across(np.flatnonzero(cut.rows >= 0))
-    return MapSolution(solution.fit._replace(poses=solution.fit.poses[rows]), log, cut)
+    found = kept.trial()
+    found.log.follow(solution.log)
+    found.cut.replace(solution.cut.rows[rows])
+    found.log.reject_across(np.flatnonzero(found.cut.rows >= 0))
+    found.take_fit(solution.fit()._replace(poses=solution.pose.rows[rows]))
+    return found
 
 
-def _carried_problem(graph: KeyframeGraph, log: ClosureLog, cuts: np.ndarray) -> _CarriedProblem:
-    """The selection with the odometry cut before keyframes `cuts` [n], ascending."""
-    log = log.copy()
-    log.reject_across(cuts)
-    sequences = np.flatnonzero(sequences_to_select(graph, log))
-    problem = selection_problem(graph, log, _uncut(graph), sequences, np.copy)
+def _carried_problem(state: MapState, log: ClosureLog, cuts: np.ndarray) -> _CarriedProblem:
+    """The selection with the odometry cut before keyframes `cuts` [n], ascending, and the closures of a
+    log."""
+    state = state.trial()
+    state.log = log.copy()
+    state.log.reject_across(cuts)
+    state.cut.rows[:] = -1
+    sequences = np.flatnonzero(sequences_to_select(state))
+    problem = selection_problem(state, sequences, np.copy)
     shows = np.array([np.append(np.flatnonzero(problem.first >= frame), -1)[0] for frame in cuts], int)
-    return _CarriedProblem(log, sequences, problem, tuple(zip(cuts.tolist(), shows.tolist(), strict=True)))
+    return _CarriedProblem(state, sequences, problem, tuple(zip(cuts.tolist(), shows.tolist(), strict=True)))
 
 
 def _retrace(
-    graph: KeyframeGraph,
     fits: np.ndarray,
     compared: np.ndarray,
     odds: GainOdds,
@@ -139,47 +135,37 @@ def _retrace(
 ) -> _ScoredMap:
     """The map after the robot has been retraced once, by the fits `compared` [N, S, N]."""
     _, (fit, *_), _, case = before
-    session = SelfTraverse.of_map(graph, fit, fits)
+    state = case.state
+    session = SelfTraverse.of_map(state, fit, fits)
     compared_there = session._replace(fits=compared)
-    poses, _, cuts = retrace(compared_there, learn_odds(session), case.cuts, log, graph.sector_angle)
-    case = _carried_problem(graph, log, cuts)
-    return _score(graph, fits, odds, case, case.starts(fit._replace(poses=poses)))
+    poses, _, cuts = retrace(compared_there, learn_odds(session), case.cuts, log, state.sector_angle)
+    case = _carried_problem(state, log, cuts)
+    return _score(fits, odds, case, case.starts(fit._replace(poses=poses)))
 
 
-def _score(
-    graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: _CarriedProblem, starts: list[MapFit]
-) -> _ScoredMap:
+def _score(fits: np.ndarray, odds: GainOdds, case: _CarriedProblem, starts: list[MapFit]) -> _ScoredMap:
     """The most likely of the selections from these starts, aligned by the views.
 
     Args:
         fits: [N, S, N], see `view_fits`. odds: the same for all maps that are compared.
     """
     selections = [case.problem.with_cuts(start, case.breaks) for start in starts]
-    likelihoods = [_likelihood(graph, fits, odds, case, one.fit) for one in selections]
+    likelihoods = [_likelihood(fits, odds, case, one.fit) for one in selections]
     selection, aligned = selections[int(np.argmax(likelihoods))], case
     for _ in range(ALIGNED):
         # Among the sequences of the case and those along the poses of the fit.
-        log, session = case.log.copy(), SelfTraverse.of_map(graph, selection.fit, fits)
-        add_closures_along(log, session, case.cuts, graph.config.max_gap)
-        aligned = _carried_problem(graph, log, case.cuts)
+        log, session = case.state.log.copy(), SelfTraverse.of_map(case.state, selection.fit, fits)
+        add_closures_along(log, session, case.cuts, case.state.config.max_gap)
+        aligned = _carried_problem(case.state, log, case.cuts)
         selection = aligned.problem.with_cuts(selection.fit, aligned.breaks)
-    return _likelihood(graph, fits, odds, case, selection.fit), selection, aligned, case
+    return _likelihood(fits, odds, case, selection.fit), selection, aligned, case
 
 
-def _likelihood(
-    graph: KeyframeGraph, fits: np.ndarray, odds: GainOdds, case: _CarriedProblem, fit: MapFit
-) -> float:
+def _likelihood(fits: np.ndarray, odds: GainOdds, case: _CarriedProblem, fit: MapFit) -> float:
     """Of all views, the cuts, the odometry and the sequences of recall; those along the poses would count
     the views twice."""
-    seen = SelfTraverse.of_map(graph, fit, fits).own_odds(odds).sum()
+    seen = SelfTraverse.of_map(case.state, fit, fits).own_odds(odds).sum()
     return float(seen) - JUMP * len(case.breaks) - case.cost(fit) / 2
-
-
-def _uncut(graph: KeyframeGraph) -> GrowableArray:
-    """[N] no keyframe cut, see `KeyframeGraph.cut`."""
-    cut = GrowableArray((), np.int64)
-    cut.replace(np.full(graph.count, -1))
-    return cut
 
 
 LONGEST = 10
@@ -220,15 +206,15 @@ EVEN = GainOdds(np.arange(BINS - 1.0), np.zeros(BINS), 0.0)
 """Odds that say nothing."""
 
 
-def view_fits(graph: KeyframeGraph) -> np.ndarray:
+def view_fits(state: MapState) -> np.ndarray:
     """[N, S, N] float32 log-odds that the view of a keyframe (first axis) is one of the place of another
     (last axis), facing alike and, with whiskers, opposite; -inf for those of nearly the same time."""
-    count, shifts = graph.count, 1 + graph.half_turns
+    count, shifts = state.count, 1 + state.half_turns
     fits = np.empty((count, shifts, count), np.float32)
     every, reversed = np.tile(np.arange(count), shifts), np.repeat(np.arange(shifts) > 0, count)
     for frame in range(count):
-        fits[frame] = graph.log_odds(frame, every, reversed).reshape(shifts, count)
-        fits[frame, :, max(frame - graph.guard, 0) : frame + graph.guard + 1] = -np.inf
+        fits[frame] = state.log_odds(frame, every, reversed).reshape(shifts, count)
+        fits[frame, :, max(frame - state.guard, 0) : frame + state.guard + 1] = -np.inf
     return fits
 
 

@@ -25,13 +25,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
-from ratslam.core.arrays import GrowableArray
 from ratslam.core.compiled import compiled
 from ratslam.mapping.ground import MOST_REACH, MOST_REACH_HEADING, REACH, REACH_HEADING, grown_reaches
-from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.loop_closures import ClosureLog, Verdict
+from ratslam.mapping.loop_closures import Verdict
+from ratslam.mapping.map_state import MapState
 from ratslam.mapping.odometry_scan import log_ratio
-from ratslam.mapping.optimizer import MapFit
 from tactile.base.se2 import correct_heading, integrate, inverse
 
 AT_ONCE = 1.0
@@ -88,70 +86,62 @@ def shipped_weights() -> np.ndarray:
     return np.array(json.loads((files(__package__) / WEIGHTS).read_text(encoding="utf-8"))["weights"])
 
 
-def judge_sequences(
-    graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray
-) -> np.ndarray:
+def judge_sequences(state: MapState, sequences: np.ndarray) -> np.ndarray:
     """[n] log-odds of sequences [n] of a map; NaN where nothing is said: of views without weights, and
-    where the robot may be carried, as odometry then gives no prior.
-
-    Args:
-        fit, log, cut: see `MapSolution`.
-    """
-    if not graph.appearance.JUDGED or graph.config.may_be_carried:
+    where the robot may be carried, as odometry then gives no prior."""
+    if not state.appearance.JUDGED or state.config.may_be_carried:
         return np.full(len(sequences), np.nan)
-    return sequence_evidence(graph, fit, log, cut, sequences, BEYOND).log_odds(shipped_weights())
+    return sequence_evidence(state, sequences, BEYOND).log_odds(shipped_weights())
 
 
-def judge_anew(graph: KeyframeGraph, log: ClosureLog, sequences: np.ndarray) -> None:
-    """Stores the log-odds of sequences [n] of the present map in the log; of those that have lost keyframes
-    by merging the former ones stay."""
-    whole = sequences[[not log.has_merged(k) for k in sequences.tolist()]]
-    log.set_log_odds(whole, judge_sequences(graph, graph.fit(), log, graph.cut, whole))
+def judge_anew(state: MapState, sequences: np.ndarray) -> None:
+    """Stores the log-odds of sequences [n] of the map in its log; of those that have lost keyframes by
+    merging the former ones stay."""
+    whole = sequences[[not state.log.has_merged(k) for k in sequences.tolist()]]
+    state.log.set_log_odds(whole, judge_sequences(state, whole))
 
 
-def doubt_of_closures(graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray) -> float:
+def doubt_of_closures(state: MapState) -> float:
     """Probability that the accepted sequences of a map are false if they are so together,
     1 / (1 + exp(S)), with the sum S of L; NaN if nothing is said of any."""
-    accepted = np.flatnonzero((log.verdicts() == Verdict.ACCEPTED) & (log.left() > 0))
-    odds = judge_sequences(graph, fit, log, cut, accepted)
+    accepted = np.flatnonzero((state.log.verdicts() == Verdict.ACCEPTED) & (state.log.left() > 0))
+    odds = judge_sequences(state, accepted)
     return float(expit(-np.nansum(odds))) if np.isfinite(odds).any() else np.nan
 
 
-def sequence_evidence(
-    graph: KeyframeGraph, fit: MapFit, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, after: int
-) -> SequenceEvidence:
+def sequence_evidence(state: MapState, sequences: np.ndarray, after: int) -> SequenceEvidence:
     """The evidence for sequences [n], each with a candidate or more, in a map of N keyframes.
 
     Args:
-        fit, log, cut: see `MapSolution`. after: number of keyframes after a sequence that are known.
+        after: number of keyframes after a sequence that are known.
     """
-    config = graph.config
+    config = state.config
     found = SequenceEvidence(np.full(len(sequences), np.nan), np.zeros((len(sequences), 2, 2, KINDS)))
-    ways = _ways(graph, log, cut, sequences, after)
+    ways = _ways(state, sequences, after)
     # Odometry into each keyframe without its systematic errors, and poses by odometry alone.
-    motion = correct_heading(graph.motion.rows, graph.length.rows, fit.bias, fit.turn_error)
-    variance = graph.own_variances()
-    reckoned = graph.dead_reckoned(graph.start.bias, graph.start.turn_error)
-    asked = np.zeros(graph.count, bool)
+    motion = correct_heading(state.motion.rows, state.length.rows, state.bias, state.turn_error)
+    variance = state.own_variances()
+    reckoned = state.dead_reckoned(state.start.bias, state.start.turn_error)
+    asked = np.zeros(state.count, bool)
     for way in ways.values():
         asked[way.low : way.high] = True
-    elsewhere = np.zeros(graph.count)  # see `_fit_elsewhere`; 0 beside all ways
-    elsewhere[asked] = _fit_elsewhere(graph, np.flatnonzero(asked))
+    elsewhere = np.zeros(state.count)  # see `_fit_elsewhere`; 0 beside all ways
+    elsewhere[asked] = _fit_elsewhere(state, np.flatnonzero(asked))
     for k, way in ways.items():
         j, i, turn = way[:3]
         x, y, heading = reckoned[: j + 1].T.copy()
         between = np.ascontiguousarray(variance[i + 1 : j + 1, 1:])
-        gate = (config.gate_sd * graph.cell) ** 2, config.gate_heading**2
-        apart = np.empty(max(j - graph.guard, 1))
+        gate = (config.gate_sd * state.cell) ** 2, config.gate_heading**2
+        apart = np.empty(max(j - state.guard, 1))
         ratio = log_ratio(x, y, heading, between, i, j, -turn, gate, apart)
         found.odometry_ratio[k] = float(np.clip(ratio, LEAST, MOST))
         reach = EXTENT + way.last - way.first + BEYOND
-        end = max(min(way.match + reach, way.middle - graph.guard), way.match) + 1
+        end = max(min(way.match + reach, way.middle - state.guard), way.match) + 1
         older = slice(max(way.match - reach, 0), end)
-        before = max(way.first - graph.guard, way.match) + 1
+        before = max(way.first - state.guard, way.match) + 1
         moved = motion[way.low : way.high], variance[way.low : way.high]
-        for g, (ground, begins) in enumerate(((fit.poses[:before], 0), (reckoned[older], older.start))):
-            found.counts[k, g] = _count_views(graph, way, *moved, elsewhere, ground, begins)
+        for g, (ground, begins) in enumerate(((state.pose.rows[:before], 0), (reckoned[older], older.start))):
+            found.counts[k, g] = _count_views(state, way, *moved, elsewhere, ground, begins)
     return found
 
 
@@ -168,12 +158,10 @@ class _Way(NamedTuple):
     last: int
 
 
-def _ways(
-    graph: KeyframeGraph, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, after: int
-) -> dict[int, _Way]:
+def _ways(state: MapState, sequences: np.ndarray, after: int) -> dict[int, _Way]:
     """The ways of sequences [n], by their row; none of those that join keyframes between which the odometry
     is broken."""
-    table, breaks = log.table(), np.flatnonzero(graph.is_broken(cut))
+    table, breaks = state.log.table(), np.flatnonzero(state.is_broken())
     order = np.argsort(table[:, 5], kind="stable")
     begin, end = np.searchsorted(table[order, 5], np.stack([sequences, sequences + 1]))
     ways = {}
@@ -184,27 +172,27 @@ def _ways(
         if part == of_match:
             first, last = int(rows[0, 0]), int(rows[-1, 0])
             low = max(first - BEYOND, int(breaks[part - 1]) if part else 0)
-            high = min(last + after + 1, int(breaks[part]) if part < len(breaks) else graph.count)
-            turn = -shift * graph.sector_angle
+            high = min(last + after + 1, int(breaks[part]) if part < len(breaks) else state.count)
+            turn = -shift * state.sector_angle
             ways[k] = _Way(middle, match, turn, low, high, max(first, low), min(last, high - 1))
     return ways
 
 
-def _fit_elsewhere(graph: KeyframeGraph, frames: np.ndarray) -> np.ndarray:
+def _fit_elsewhere(state: MapState, frames: np.ndarray) -> np.ndarray:
     """[n] log of the mean likelihood of the views of keyframes [n] at up to `CONTROLS` keyframes elsewhere,
     in turn seen ahead and, where half turns are compared, from the opposite direction."""
-    others = np.unique(np.linspace(0, graph.count - 1, CONTROLS).astype(int))
+    others = np.unique(np.linspace(0, state.count - 1, CONTROLS).astype(int))
     shape = len(frames), len(others)
     row, control = (each.ravel() for each in np.indices(shape))
-    reversed = (control % 2 > 0) & graph.half_turns
-    odds = graph.log_odds(frames[row], others[control], reversed).reshape(shape)
-    away = np.abs(others - frames[:, None]) > graph.guard
+    reversed = (control % 2 > 0) & state.half_turns
+    odds = state.log_odds(frames[row], others[control], reversed).reshape(shape)
+    away = np.abs(others - frames[:, None]) > state.guard
     mean = np.where(away, np.exp(odds), 0.0).sum(axis=1) / np.maximum(away.sum(axis=1), 1)
     return np.where(mean > 0, np.log(np.where(mean > 0, mean, 1.0)), 0.0)
 
 
 def _count_views(
-    graph: KeyframeGraph,
+    state: MapState,
     way: _Way,
     motion: np.ndarray,
     variance: np.ndarray,
@@ -219,18 +207,18 @@ def _count_views(
             `_fit_elsewhere`.
     """
     start = ground[way.match - begins] + [0.0, 0.0, way.turn]
-    reach, turns = REACH * graph.cell, np.arange(1 + graph.half_turns) * np.pi
+    reach, turns = REACH * state.cell, np.arange(1 + state.half_turns) * np.pi
     middle, lag = way.middle - way.low, way.low - begins
     ahead = integrate(motion[middle + 1 :], start)
     back = integrate(inverse(motion[middle:0:-1]), start)[::-1]
     path = np.concatenate([back, start[None], ahead])
     limits = (STRAY + MOST_REACH) * reach, MOST_REACH_HEADING * REACH_HEADING * 1.5
-    frame, other, turned = _pairs(path, ground, turns, *limits, lag, graph.guard)
-    fits = graph.log_odds(frame + way.low, other + begins, turned > 0) - elsewhere[frame + way.low]
+    frame, other, turned = _pairs(path, ground, turns, *limits, lag, state.guard)
+    fits = state.log_odds(frame + way.low, other + begins, turned > 0) - elsewhere[frame + way.low]
     offsets = np.searchsorted(frame, np.arange(len(path) + 1))
     near = ground, turns, offsets, other, turned, fits
-    bounds = reach, REACH_HEADING, graph.closure_variance(), EDGES
-    kinds = _follow(start, middle, motion, variance, near, bounds, lag, graph.guard)
+    bounds = reach, REACH_HEADING, state.closure_variance(), EDGES
+    kinds = _follow(start, middle, motion, variance, near, bounds, lag, state.guard)
     within = np.zeros(len(path), bool)
     within[way.first - way.low : way.last + 1 - way.low] = True
     return np.stack([np.bincount(kinds[part & (kinds >= 0)], minlength=KINDS) for part in (within, ~within)])

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed
-from ratslam.mapping.keyframe_graph import Place
-from ratslam.mapping.merging import Merge
 from ratslam.mapping.optimizer import LoopClosures, MapFit, MapProblem, System
+from ratslam.mapping.pieces import Place
+from ratslam.recall.memory import MergedRows
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
 
 ACCEPTED_WEIGHT = 0.25
@@ -275,9 +275,9 @@ class MapHypotheses(Checkpointed):
         self._calibration = np.array([[fit.bias, fit.turn_error] for fit in fits])
         return fits
 
-    def merge(self, merge: Merge) -> None:
+    def merge(self, merge: MergedRows) -> None:
         """Follows a merge of keyframes; later ones than the maps have are kept."""
-        self.poses = self.poses[:, merge.kept[merge.kept < self.poses.shape[1]]]
+        self.poses = self.poses[:, merge.source[merge.source < self.poses.shape[1]]]
 
     def _fits(self, count: int) -> list[MapFit]:
         weights, maps = np.ones(count), zip(self.poses, self._calibration.tolist(), strict=True)

@@ -17,15 +17,12 @@ the probability that the map is worse than odometry (`python -m ratslam reproduc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
 from enum import StrEnum
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import expit
 
-from ratslam.core.arrays import GrowableArray
 from ratslam.mapping.appearance import near_facing
 from ratslam.mapping.closure_judge import judge_anew
 from ratslam.mapping.closure_selection import (
@@ -38,12 +35,13 @@ from ratslam.mapping.closure_selection import (
     select_closures,
     select_closures_and_cuts,
 )
-from ratslam.mapping.keyframe_graph import KeyframeGraph, Place, number_pieces
-from ratslam.mapping.loop_closures import ClosureLog, Verdict
+from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.mapping.map_state import MapState
 from ratslam.mapping.odometry_calibration import HeadingNoise, learn_heading_noise, log_posterior
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, System, solve
+from ratslam.mapping.pieces import Place
 from ratslam.mapping.verification import find_break, spans
-from tactile.base.se2 import between, compose, inverse, wrap
+from tactile.base.se2 import between, wrap
 
 RADIUS = 2.0
 """Distance within which keyframes are near each other, cells."""
@@ -60,7 +58,7 @@ ALONE = 5.0
 
 
 def claimed_revisits(
-    graph: KeyframeGraph, poses: np.ndarray, most: int
+    state: MapState, poses: np.ndarray, most: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """The claims of poses [N, 3] of the keyframes; at most `most` keyframes are examined, spread evenly.
 
@@ -70,19 +68,19 @@ def claimed_revisits(
         chance (a control is as many keyframes elsewhere among the older ones, in the same order); and how
         many keyframes were examined.
     """
-    first, count = graph.guard + 1, len(poses)
+    first, count = state.guard + 1, len(poses)
     frames = np.unique(np.linspace(first, count - 1, max(min(count - first, most), 0)).astype(int))
-    facing = near_facing(poses, frames, graph.guard, RADIUS * graph.cell, FACING)
-    row, near = np.nonzero(facing if graph.half_turns else facing > 0)
+    facing = near_facing(poses, frames, state.guard, RADIUS * state.cell, FACING)
+    row, near = np.nonzero(facing if state.half_turns else facing > 0)
     frame, reversed = frames[row], facing[row, near] < 0
     if not len(frame):
         return frame, near, np.zeros(0), len(frames)
     shares = np.concatenate([[0.0], CONTROLS])
-    older = (frame - graph.guard)[:, None]
+    older = (frame - state.guard)[:, None]
     others = (near[:, None] + (older * shares).astype(int)) % older
     repeated = len(shares)
-    misfits = graph.misfits(np.repeat(frame, repeated), others.ravel(), np.repeat(reversed, repeated))
-    passes = np.flatnonzero(np.diff(near, prepend=-1 - graph.guard) > graph.guard)
+    misfits = state.misfits(np.repeat(frame, repeated), others.ravel(), np.repeat(reversed, repeated))
+    passes = np.flatnonzero(np.diff(near, prepend=-1 - state.guard) > state.guard)
     passes = np.union1d(passes, np.flatnonzero(np.diff(frame, prepend=-1)))
     best = np.minimum.reduceat(misfits.reshape(others.shape), passes, axis=0)
     here, elsewhere = best[:, :1], best[:, 1:]
@@ -90,11 +88,11 @@ def claimed_revisits(
     return frame[passes], near[passes], rank, len(frames)
 
 
-def claims_cost(graph: KeyframeGraph, poses: np.ndarray) -> float:
+def claims_cost(state: MapState, poses: np.ndarray) -> float:
     """What the views say against poses [N, 3] of the keyframes, chi-square: -2 times the log ratio of the
     density of the ranks where claims are right to that where they are wrong (uniform), for as many
     independent views as there are times `ALONE` keyframes."""
-    claimant, _, rank, examined = claimed_revisits(graph, poses, JUDGED)
+    claimant, _, rank, examined = claimed_revisits(state, poses, JUDGED)
     if not len(claimant):
         return 0.0
     right = DOUBTFUL + (1 - DOUBTFUL) * SHAPE * rank ** (SHAPE - 1)
@@ -111,156 +109,133 @@ class Obstacle(StrEnum):
     ONLY_LINK = "is the only link across a break of the odometry"
 
 
-class MapSolution(NamedTuple):
-    """Optimised poses and bias, the closure log with its verdicts, and the odometry breaks ([N]
-    sequences)."""
+def obstacle(solution: MapState, sequence: int, log: ClosureLog) -> Obstacle | None:
+    """Why a sequence cannot be undone; None if it can.
 
-    fit: MapFit
-    log: ClosureLog
-    cut: GrowableArray
-
-    @classmethod
-    def solved(cls, graph: KeyframeGraph, log: ClosureLog) -> MapSolution:
-        """The map with the closures accepted so far, optimised; dead reckoning without any."""
-        if len(log.accepted_rows()):
-            return cls(graph.solve(log, graph.config.settling), log, graph.cut)
-        return cls(graph.fit()._replace(poses=graph.pose.rows.copy()), log, graph.cut)
-
-    def placed(self, graph: KeyframeGraph) -> MapSolution:
-        """The map with the pieces of `graph` where they belong, see `placed_pieces`; the fit may have moved
-        them."""
-        poses = graph.placement(self.log)(self.fit.poses)
-        return self._replace(fit=self.fit._replace(poses=poses))
-
-    def without_closures(self, graph: KeyframeGraph) -> MapSolution:
-        """Odometry as it was read, without cuts; all accepted sequences are open."""
-        log, cut = self.log.copy(), deepcopy(self.cut)
-        for sequence in np.flatnonzero(log.verdicts() == Verdict.ACCEPTED).tolist():
-            log.judge(sequence, Verdict.OPEN)
-        cut.rows[:] = -1
-        return MapSolution(MapFit(graph.dead_reckoned(), 0.0, np.zeros(0)), log, cut)
-
-    def pieces(self, graph: KeyframeGraph) -> np.ndarray:
-        """[N] the piece of each keyframe of a graph that is not merged."""
-        return number_pieces(graph.is_broken(self.cut), self.log.accepted_pairs())
-
-    def open_pieces(self, graph: KeyframeGraph) -> np.ndarray:
-        """[N] bool, keyframes of a piece without an accepted closure."""
-        piece = self.pieces(graph)
-        return ~np.isin(piece, piece[self.log.accepted_pairs()[:, 0]])
-
-    def by_odometry(self, graph: KeyframeGraph, odometry: np.ndarray) -> MapSolution:
-        """The map whose pieces without an accepted closure are their odometry, from where each begins: what
-        views alone show of its bias may be wrong. The one place for this rule.
-
-        Args:
-            odometry: [N, 3] of the keyframes; NaN where it is not known, which leaves a piece as it is.
-        """
-        fit, piece, open_ = self.fit, self.pieces(graph), self.open_pieces(graph)
-        poses = fit.poses.copy()
-        for number in np.unique(piece[open_]).tolist():
-            rows = np.flatnonzero(piece == number)
-            own = odometry[rows]
-            if rows[0]:
-                own = compose(compose(poses[rows[0]], inverse(own[0])), own)
-            poses[rows] = np.where(np.isfinite(own).all(), own, poses[rows])
-        fit = fit._replace(poses=poses)
-        if open_.all() and np.isfinite(odometry).all():
-            fit = fit._replace(bias=graph.start.bias, turn_error=graph.start.turn_error)
-        return self._replace(fit=fit)
-
-    def obstacle(self, sequence: int, log: ClosureLog) -> Obstacle | None:
-        """Why a sequence cannot be undone; None if it can.
-
-        Args:
-            log: the one from which this solution was selected.
-        """
-        if not 0 <= sequence < log.sequences or self.log.verdict(sequence) != Verdict.ACCEPTED:
-            return Obstacle.NOT_ACCEPTED
-        if log.has_merged(sequence):
-            return Obstacle.MERGED
-        return Obstacle.ONLY_LINK if np.any(self.cut.rows == sequence) else None
+    Args:
+        log: the one from which the solution was selected.
+    """
+    if not 0 <= sequence < log.sequences or solution.log.verdict(sequence) != Verdict.ACCEPTED:
+        return Obstacle.NOT_ACCEPTED
+    if log.has_merged(sequence):
+        return Obstacle.MERGED
+    return Obstacle.ONLY_LINK if np.any(solution.cut.rows == sequence) else None
 
 
-def cheapest_map(graph: KeyframeGraph, log: ClosureLog, priors: Sequence[CalibrationPrior]) -> MapSolution:
+def undo(solution: MapState, sequence: int, log: ClosureLog) -> None:
+    """Removes a sequence of a log, from which the solution was selected.
+
+    Raises:
+        ValueError: it has an `Obstacle`.
+    """
+    against = obstacle(solution, sequence, log)
+    if against is not None:
+        raise ValueError(f"sequence {sequence} {against}")
+    log.judge(sequence, Verdict.UNDONE)
+
+
+def cheapest_map(state: MapState, priors: Sequence[CalibrationPrior]) -> MapState:
     """The map of least cost with the closures accepted so far, reached from the current poses and from dead
-    reckoning with the mean of each of these calibrations. The log takes over its robust weights."""
-    problem = graph.problem(log, graph.cut)
-    place = graph.placement(log)
-    starts = [graph.fit(), *(_dead_reckoned(graph, prior, place) for prior in priors)]
-    system = System(problem)
-    fit = min((system.solve(start, 2 * graph.config.settling) for start in starts), key=system.robust_cost)
-    log.weigh(fit.weights)
-    return MapSolution(fit, log, graph.cut)
+    reckoning with the mean of each of these calibrations. The log of `state` takes over its robust
+    weights."""
+    system, place = System(state.problem()), state.placement()
+    starts = [state.fit(), *(_dead_reckoned(state, prior, place) for prior in priors)]
+    fit = min((system.solve(start, 2 * state.config.settling) for start in starts), key=system.robust_cost)
+    state.log.weigh(fit.weights)
+    found = state.trial()
+    found.take_fit(fit)
+    return found
 
 
-def selected_solution(graph: KeyframeGraph, log: ClosureLog, hypotheses: MapHypotheses) -> MapSolution | None:
+def selected_solution(state: MapState, hypotheses: MapHypotheses) -> MapState | None:
     """The map with the closure sequences that are best accepted together; None if none has the evidence of an
     accepted one: weak sequences count only beside it, as images without information give a few of them."""
-    config, log, cut = graph.config, deepcopy(log), deepcopy(graph.cut)
-    candidates = sequences_to_select(graph, log)
-    if not (candidates & (log.scores() >= config.min_score)).any():
+    config, candidates = state.config, sequences_to_select(state)
+    if not (candidates & (state.log.scores() >= config.min_score)).any():
         return None
-    place = graph.placement(log)
-    sequences = np.flatnonzero(candidates)
-    judge_anew(graph, log, sequences)
-    broken = np.flatnonzero(np.isin(cut.rows, sequences))
-    earlier = tuple((frame, int(np.searchsorted(sequences, cut.rows[frame]))) for frame in broken.tolist())
-    cut.rows[broken] = -1  # those of sequences all of whose keyframes are merged stay
-    problem = selection_problem(graph, log, cut, sequences, place)
+    found, place, sequences = state.trial(), state.placement(), np.flatnonzero(candidates)
+    cut = found.cut.rows
+    judge_anew(found, sequences)
+    broken = np.flatnonzero(np.isin(cut, sequences))
+    earlier = tuple((frame, int(np.searchsorted(sequences, cut[frame]))) for frame in broken.tolist())
+    cut[broken] = -1  # those of sequences all of whose keyframes are merged stay
+    problem = selection_problem(found, sequences, place)
     # From the current map and from the hypotheses; odometry is cut only if the robot may be carried.
-    present = graph.fit()._replace(poses=graph.pose.rows.copy())
-    starts = [present, *hypotheses.follow(problem, sequences)]
+    starts = [found.fit(), *hypotheses.follow(problem, sequences)]
     if config.may_be_carried:
-        selected = select_closures_and_cuts(problem, starts, partial(find_break, graph), earlier)
+        selected = select_closures_and_cuts(problem, starts, partial(find_break, found), earlier)
     else:
         selected = select_closures(problem, starts)
-        noise, start = graph.heading_noise, HeadingNoise.of_start(config)
+        noise, start = state.heading_noise, HeadingNoise.of_start(config)
         if noise.log_factor - start.log_factor > NOISY * noise.sd:  # surely above that of the start
-            reckoned = _dead_reckoned(graph, problem.measurements.prior, place)
+            reckoned = _dead_reckoned(found, problem.measurements.prior, place)
             selected = reselect(problem, selected, reckoned, noise, start)
-    return selected_map(graph, log, cut, sequences, selected)
+    return selected_map(found, sequences, selected)
 
 
-def sequences_to_select(graph: KeyframeGraph, log: ClosureLog) -> np.ndarray:
+def solution_with(state: MapState, sequences: Sequence[Sequence[Candidate]], least: float) -> MapState | None:
+    """The map with further closure sequences, from these poses; selected with all others where sequences are
+    selected. None if less than a share `least` of the evidence of the further ones is accepted."""
+    log, first, selected = state.log, state.log.sequences, None
+    for sequence in sequences:
+        log.add_accepted(sequence)
+    state.optimise()
+    if state.config.select_every:
+        hypotheses = MapHypotheses()
+        hypotheses.begin(state.fit(), log.sequences)
+        selected = selected_solution(state, hypotheses)
+    solution = selected or state.solved()
+    new = np.arange(log.sequences) >= first
+    standing = new & (solution.log.verdicts() == Verdict.ACCEPTED)
+    scores = solution.log.scores()
+    return solution if new.any() and scores[standing].sum() >= least * scores[new].sum() else None
+
+
+def sequences_to_select(state: MapState) -> np.ndarray:
     """[R] bool, the sequences to select from."""
-    config = graph.config
+    config, log = state.config, state.log
     enough = (log.scores() >= config.select_score) & (log.sizes() >= config.select_length)
     possible = (log.left() > 0) & (log.verdicts() != Verdict.UNDONE)
-    return enough & possible & ~spans(graph.pieces(log), log)
+    return enough & possible & ~spans(state.pieces(), log)
 
 
-def selection_problem(
-    graph: KeyframeGraph, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, place: Place
-) -> SelectionProblem:
-    """The problem of a selection among sequences [R], which the log then holds for accepted, with the
-    odometry broken at `cut`."""
+def selection_problem(state: MapState, sequences: np.ndarray, place: Place) -> SelectionProblem:
+    """The problem of a selection among sequences [R], which the map then holds for accepted."""
+    log = state.log
     for sequence in np.flatnonzero((log.left() > 0) & (log.verdicts() != Verdict.UNDONE)).tolist():
         log.judge(sequence, Verdict.OPEN)
     for sequence in sequences.tolist():
         log.judge(sequence, Verdict.ACCEPTED)
-    problem, (first, last) = graph.problem(log, cut), log.spans()[sequences].T
+    problem, (first, last) = state.problem(), log.spans()[sequences].T
     evidence = np.maximum(log.scores() * log.credit(), 1.0)[sequences]
-    return SelectionProblem(problem, evidence, first, last, partial(claims_cost, graph), place)
+    return SelectionProblem(problem, evidence, first, last, partial(claims_cost, state), place)
 
 
 def selected_map(
-    graph: KeyframeGraph, log: ClosureLog, cut: GrowableArray, sequences: np.ndarray, selection: Selection
-) -> MapSolution:
-    """The map of a selection among sequences [R]; log and cut take it over."""
+    state: MapState, sequences: np.ndarray, selection: Selection, recalled: int | None = None
+) -> MapState:
+    """The same map, which takes over a selection among sequences [R].
+
+    Args:
+        recalled: number of sequences of recall, which stay in the log if they are refused; None: all.
+    """
     for sequence, weight in zip(sequences.tolist(), selection.fit.weights.tolist(), strict=True):
-        log.judge(sequence, Verdict.ACCEPTED if weight > ACCEPTED_WEIGHT else Verdict.OPEN)
+        state.log.judge(sequence, Verdict.ACCEPTED if weight > ACCEPTED_WEIGHT else Verdict.OPEN)
     for frame, sequence in selection.cuts:
-        cut.rows[frame] = sequences[sequence]
+        state.cut.rows[frame] = sequences[sequence]
     # Solved once more without the refused sequences, which removes their remaining pull.
-    fit = solve(selection.fit, graph.problem(log, cut), STEPS, FINE)
-    log.weigh(fit.weights)
-    return MapSolution(fit, log, cut)
+    fit = solve(selection.fit, state.problem(), STEPS, FINE)
+    state.log.weigh(fit.weights)
+    state.take_fit(fit)
+    if recalled is not None:
+        refused = np.flatnonzero(state.log.verdicts() != Verdict.ACCEPTED)
+        state.log.reject_sequences(refused[refused >= recalled])
+    return state
 
 
-def _dead_reckoned(graph: KeyframeGraph, prior: CalibrationPrior, place: Place) -> MapFit:
+def _dead_reckoned(state: MapState, prior: CalibrationPrior, place: Place) -> MapFit:
     """Odometry corrected by the mean of a calibration, from the first keyframe, its pieces placed."""
-    poses = place(graph.dead_reckoned(prior.bias, prior.turn_error))
+    poses = place(state.dead_reckoned(prior.bias, prior.turn_error))
     return MapFit(poses, prior.bias, np.zeros(0), prior.turn_error)
 
 
@@ -327,14 +302,14 @@ NEUTRAL = 3.0
 """Evidence added to that of the refused sequences, half of it explained."""
 
 
-def worse_than_odometry(graph: KeyframeGraph, solution: MapSolution) -> float:
+def worse_than_odometry(solution: MapState) -> float:
     """Probability that the map's error is worse than odometry's; NaN without closures."""
     if not len(solution.log.accepted_rows()):
         return np.nan
-    return float(expit(INTERCEPT + WEIGHTS @ health_features(graph, solution)))
+    return float(expit(INTERCEPT + WEIGHTS @ health_features(solution)))
 
 
-def health_features(graph: KeyframeGraph, solution: MapSolution) -> np.ndarray:
+def health_features(solution: MapState) -> np.ndarray:
     """[5] the statistics of a map of at least two keyframes.
 
     Returns:
@@ -343,27 +318,28 @@ def health_features(graph: KeyframeGraph, solution: MapSolution) -> np.ndarray:
         `WINDOW` keyframes. 3: strain times the log ratio of odometry. 4: share of the evidence of refused
         sequences that the map does not explain, minus odometry's share.
     """
-    reckoned = graph.dead_reckoned()
-    of_map = _claims_ratio(graph, solution.fit.poses)
-    of_odometry = _claims_ratio(graph, reckoned)
-    sums, poses = np.cumsum(solution.fit.strain(graph.odometry(solution.cut))), solution.fit.poses
+    reckoned = solution.dead_reckoned()
+    of_map = _claims_ratio(solution, solution.pose.rows)
+    of_odometry = _claims_ratio(solution, reckoned)
+    sums, poses = np.cumsum(solution.fit().strain(solution.odometry())), solution.pose.rows
     window = sums[WINDOW:] - sums[:-WINDOW] if len(sums) > WINDOW else sums[-1:]
     strain = float(np.log10(max(window.max(initial=0.0), 0.0) + 1e-6))
-    unexplained, before = (_unexplained(graph, solution.log, each) for each in (poses, reckoned))
+    unexplained, before = (_unexplained(solution, each) for each in (poses, reckoned))
     return np.array([of_map - of_odometry, of_odometry, strain, strain * of_odometry, unexplained - before])
 
 
-def _claims_ratio(graph: KeyframeGraph, poses: np.ndarray) -> float:
+def _claims_ratio(state: MapState, poses: np.ndarray) -> float:
     """Log ratio of the claims of revisits that the views confirm to those that they contradict."""
-    _, _, rank, examined = claimed_revisits(graph, poses, EXAMINED)
+    _, _, rank, examined = claimed_revisits(state, poses, EXAMINED)
     sides = 2 * rank - 1
     each = max(examined, 1)
     agreed, contradicted = np.maximum(sides, 0).sum() / each, np.maximum(-sides, 0).sum() / each
     return float(np.log((agreed + LEAST_CLAIMS) / (contradicted + LEAST_CLAIMS)))
 
 
-def _unexplained(graph: KeyframeGraph, log: ClosureLog, poses: np.ndarray) -> float:
+def _unexplained(state: MapState, poses: np.ndarray) -> float:
     """Share of the evidence of refused sequences that poses [N, 3] do not explain."""
+    log = state.log
     table = log.table()
     table = table[table[:, 5] >= 0]
     sequence = table[:, 5].astype(int)
@@ -373,8 +349,8 @@ def _unexplained(graph: KeyframeGraph, log: ClosureLog, poses: np.ndarray) -> fl
     worth = worth * np.maximum(table[:, 4], 0.0)
     j, i = table[:, :2].astype(int).T
     error = between(poses[i], poses[j])
-    error[:, 2] = wrap(error[:, 2] + table[:, 2] * graph.sector_angle)
+    error[:, 2] = wrap(error[:, 2] + table[:, 2] * state.sector_angle)
     far, turned = error[:, 0] ** 2 + error[:, 1] ** 2, error[:, 2] / HEADING
-    apart = far / (PLACE * graph.cell) ** 2 + turned**2
+    apart = far / (PLACE * state.cell) ** 2 + turned**2
     lost = (worth * apart / (1 + apart)).sum()
     return float((lost + NEUTRAL / 2) / (worth.sum() + NEUTRAL))

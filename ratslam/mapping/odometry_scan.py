@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.core.compiled import compiled
-from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.map_state import MapState
 from ratslam.mapping.optimizer import CalibrationPrior
 
 BIAS_SPAN, BIAS_STEPS = 0.06, 241
@@ -29,23 +29,23 @@ TURN = 2 * float(np.pi)
 
 
 class OdometryScan:
-    """Dead-reckoned paths of the keyframes of a graph, none merged, for all calibrations of the grid. Holds
-    nothing that does not follow from the graph, so a checkpoint leaves it out.
+    """Dead-reckoned paths of the keyframes of a map, none merged, for all calibrations of the grid. Holds
+    nothing that does not follow from the map, so a checkpoint leaves it out.
 
     Attributes:
         grid: [G, 2] heading biases, rad/m, and turn errors, rad/rad.
     """
 
-    def __init__(self, graph: KeyframeGraph) -> None:
-        prior, spans = graph.prior, np.linspace(-TURN_SPAN, TURN_SPAN, TURN_STEPS)
-        self._biases = prior.bias + np.linspace(-BIAS_SPAN, BIAS_SPAN, BIAS_STEPS) / graph.cell
+    def __init__(self, state: MapState) -> None:
+        prior, spans = state.prior, np.linspace(-TURN_SPAN, TURN_SPAN, TURN_STEPS)
+        self._biases = prior.bias + np.linspace(-BIAS_SPAN, BIAS_SPAN, BIAS_STEPS) / state.cell
         turn = prior.turn_error + (spans * prior.turn_error_sd if prior.turn_error_sd > 0 else np.zeros(1))
         self.grid = np.stack(np.meshgrid(self._biases, turn, indexing="ij"), axis=-1).reshape(-1, 2)
         self._near: dict[tuple[CalibrationPrior, float], np.ndarray] = {}
         self.clear()
 
     def clear(self) -> None:
-        """Forgets all paths; they are computed anew from the graph."""
+        """Forgets all paths; they are computed anew from the map."""
         self._count = 1
         self._total = np.zeros((1, 3))  # sums of heading, distance and net turn of the odometry
         self._end = np.zeros((len(self.grid), 2))
@@ -66,29 +66,29 @@ class OdometryScan:
             found = self._near[prior, reach] = np.flatnonzero(apart <= 1)
         return found
 
-    def log_ratios(self, graph: KeyframeGraph, member: np.ndarray, near: np.ndarray) -> np.ndarray:
+    def log_ratios(self, state: MapState, member: np.ndarray, near: np.ndarray) -> np.ndarray:
         """[G] log of the probability density that odometry gave to the place of a closure, over its mean
         density at all keyframes that could be recalled.
 
         Args:
-            graph: of all keyframes so far, which grow from call to call. member: keyframe, match and shift
+            state: of all keyframes so far, which grow from call to call. member: keyframe, match and shift
                 of the closure. near: points of the grid to compute; elsewhere NaN.
         """
         # Keyframes added since are dead reckoned one at a time: every path has the same bits whenever it is
         # computed.
         held = len(self._total)
-        if graph.count > held:
-            size = max(256, 2 * graph.count) - held
+        if state.count > held:
+            size = max(256, 2 * state.count) - held
             self._total = np.pad(self._total, ((0, size), (0, 0)))
             self._path = np.pad(self._path, ((0, 0), (0, 0), (0, size)))
-        motion, length = graph.motion.rows, graph.length.rows
+        motion, length = state.motion.rows, state.length.rows
         _extend_paths(self._path, self._total, self.grid, motion, length, self._count, self._end)
-        self._count = max(graph.count, 1)
-        config = graph.config
+        self._count = max(state.count, 1)
+        config = state.config
         j, i, shift = (int(value) for value in member[:3])
-        variance = np.ascontiguousarray(graph.variances(graph.cut)[i + 1 : j + 1, 1:])
-        gate = (config.gate_sd * graph.cell) ** 2, config.gate_heading**2
-        turned, old = shift * graph.sector_angle, max(j - graph.guard, 1)
+        variance = np.ascontiguousarray(state.variances()[i + 1 : j + 1, 1:])
+        gate = (config.gate_sd * state.cell) ** 2, config.gate_heading**2
+        turned, old = shift * state.sector_angle, max(j - state.guard, 1)
         path, total = self._path, self._total
         return _compute_log_ratios(path, total, self.grid, near, variance, i, j, turned, old, gate)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ratslam.core.compiled import compiled
 from ratslam.mapping.ground import LEAVING, REACH, REACH_HEADING, GainOdds, Ground, grown_reaches
-from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.map_state import MapState
 from ratslam.mapping.optimizer import MapFit
 from tactile.base.se2 import inverse
 
@@ -40,12 +40,12 @@ class SelfTraverse(NamedTuple):
     variances: np.ndarray
 
     @classmethod
-    def of_map(cls, graph: KeyframeGraph, fit: MapFit, fits: np.ndarray) -> SelfTraverse:
+    def of_map(cls, state: MapState, fit: MapFit, fits: np.ndarray) -> SelfTraverse:
         """The keyframes of a map at the poses of a fit."""
-        motions = fit.corrected(graph.odometry(graph.cut))
-        variances = graph.odometry_variance(graph.length.rows, graph.turn.rows)[1:]
-        turns, reach = np.arange(fits.shape[1]) * np.pi, REACH * graph.cell
-        ground = Ground(fit.poses, turns, reach, REACH_HEADING, graph.closure_variance())
+        motions = fit.corrected(state.odometry())
+        variances = state.odometry_variance(state.length.rows, state.turn.rows)[1:]
+        turns, reach = np.arange(fits.shape[1]) * np.pi, REACH * state.cell
+        ground = Ground(fit.poses, turns, reach, REACH_HEADING, state.closure_variance())
         return cls(ground, fits, motions, variances)
 
     @property

@@ -10,16 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from copy import deepcopy
-from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray, with_prefix
 from ratslam.mapping.closure_selection import FINE, STEPS, MapHypotheses
-from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import ClosureLog
 from ratslam.mapping.map_solution import selected_solution
+from ratslam.mapping.map_state import MapState
 from ratslam.mapping.odometry_calibration import HeadingNoise
 from ratslam.mapping.optimizer import MapFit, solve
 from tactile.base.se2 import compose, inverse
@@ -87,7 +86,7 @@ class SelectedMap(Checkpointed):
     Attributes:
         found: whether any sequence had enough evidence; without one only the hypotheses count. before: [R]
         verdicts before the selection. log: with the verdicts after it. poses [N, 3], calibration
-            (rad/m, rad/rad), cut, noise: see `KeyframeGraph`.
+            (rad/m, rad/rad), cut, noise: see `MapState`.
     """
 
     VALUES = ("found", "before", "poses", "calibration", "noise")
@@ -99,29 +98,28 @@ class SelectedMap(Checkpointed):
         self.poses, self.calibration, self.noise = np.zeros((0, 3)), (0.0, 0.0), HeadingNoise()
         self.cut = GrowableArray((), np.int64)
 
-    def select(self, graph: KeyframeGraph) -> SelectedMap:
-        """Selects, and learns the noise of the odometry from the result; changes `graph`."""
-        solution = selected_solution(graph, self.log, self.hypotheses)
+    def select(self, state: MapState) -> MapState | None:
+        """Selects, and learns the noise of the odometry from the result, which is returned."""
+        solution = selected_solution(state, self.hypotheses)
         if solution is not None:
-            fit, self.log, self.cut = solution
-            graph.cut = self.cut
-            graph.learn_noise(fit, self.log)
-            self.poses, self.calibration = fit.poses, (fit.bias, fit.turn_error)
-            self.noise, self.found = graph.heading_noise, True
-        return self
+            solution.learn_noise()
+            self.log, self.cut, self.poses = solution.log, solution.cut, solution.pose.rows
+            self.calibration, self.noise = (solution.bias, solution.turn_error), solution.heading_noise
+            self.found = True
+        return solution
 
-    def take_up(self, graph: KeyframeGraph, log: ClosureLog) -> None:
+    def take_up(self, state: MapState) -> None:
         """Moves the map to the selected one, continued by the poses since; verdicts given since then stay."""
-        self.judge(log)
+        self.judge(state.log)
         size, (bias, turn_error) = len(self.poses), self.calibration
-        graph.cut.rows[:size] = self.cut.rows
-        graph.heading_noise = self.noise
-        moved = compose(self.poses[-1], inverse(graph.pose.rows[size - 1]))
-        poses = np.concatenate([self.poses, compose(moved, graph.pose.rows[size:])])
-        start = MapFit(graph.placement(log)(poses), bias, np.zeros(0), turn_error)
-        fit = solve(start, graph.problem(log, graph.cut), STEPS, FINE)
-        log.weigh(fit.weights)
-        graph.move_to(fit, log)
+        state.cut.rows[:size] = self.cut.rows
+        state.heading_noise = self.noise
+        moved = compose(self.poses[-1], inverse(state.pose.rows[size - 1]))
+        poses = np.concatenate([self.poses, compose(moved, state.pose.rows[size:])])
+        start = MapFit(state.placement()(poses), bias, np.zeros(0), turn_error)
+        fit = solve(start, state.problem(), STEPS, FINE)
+        state.log.weigh(fit.weights)
+        state.move_to(fit)
 
     def judge(self, log: ClosureLog) -> None:
         """Takes over the verdicts on sequences whose verdict has not changed since the selection began."""
@@ -138,21 +136,26 @@ class SelectionWorker(Checkpointed):
         self.job = DelayedJob(THREAD, lambda: SelectedMap(ClosureLog(), MapHypotheses()))
         self.hypotheses = MapHypotheses()
 
-    def begin(self, graph: KeyframeGraph, log: ClosureLog) -> None:
+    def begin(self, state: MapState) -> None:
         """Begins a selection if it is due."""
-        every = graph.config.select_every
-        if every and graph.total % every == 0:
-            selected = SelectedMap(log.copy(), deepcopy(self.hypotheses))
-            due = graph.total + min(DELAY, every)
-            self.job.begin(due, partial(selected.select, graph.copy()))
+        every = state.config.select_every
+        if every and state.total % every == 0:
+            present = state.copy()
+            selected = SelectedMap(present.log, deepcopy(self.hypotheses))
 
-    def finish(self, graph: KeyframeGraph, log: ClosureLog) -> bool:
+            def select() -> SelectedMap:
+                selected.select(present)
+                return selected
+
+            self.job.begin(state.total + min(DELAY, every), select)
+
+    def finish(self, state: MapState) -> bool:
         """Takes up a selection if it is due; whether it changed the map."""
-        selected = self.job.take(graph.total)
+        selected = self.job.take(state.total)
         if selected is None:
             return False
         self.hypotheses = selected.hypotheses
         if selected.found:
-            selected.take_up(graph, log)
-            log.count_selection()
+            selected.take_up(state)
+            state.log.count_selection()
         return selected.found

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.mapping.loop_closures import Candidate, ClosureLog
+from ratslam.mapping.map_state import MapState
 from ratslam.mapping.optimizer import MapCovariance
-from tactile.base.se2 import between, compose, inverse, wrap
+from tactile.base.se2 import between, compose, wrap
 
 
 def turn_on_spot(pose: np.ndarray, angle: float) -> np.ndarray:
@@ -21,37 +21,37 @@ def turn_on_spot(pose: np.ndarray, angle: float) -> np.ndarray:
     return compose(pose, np.array([0.0, 0.0, angle]))
 
 
-def continues_sequence(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> bool:
+def continues_sequence(state: MapState, candidate: Candidate) -> bool:
     """Whether the candidate moved from the newest one by the same motion in memory as in odometry."""
-    last, config = log.last(), graph.config
+    last, config = state.log.last(), state.config
     if last is None or candidate.keyframe - last.keyframe > config.max_gap:
         return False
-    remembered, travelled = _motions(graph, last, candidate)
+    remembered, travelled = _motions(state, last, candidate)
     apart = np.hypot(*(remembered - travelled)[:2])
-    allowed = config.agreement * graph.cell + 0.1 * np.hypot(*travelled[:2])
+    allowed = config.agreement * state.cell + 0.1 * np.hypot(*travelled[:2])
     if not (apart < allowed and abs(wrap(remembered[2] - travelled[2])) < config.agreement_heading):
         return False
     if not config.sequence_agreement:
         return True
     # The motion from the first member of the newest sequence has to agree with odometry too.
-    frame, match, shift, _ = log.members(log.sequences - 1)[0]
-    remembered, travelled = _motions(graph, Candidate(frame, match, shift, 0.0, 0.0), candidate)
-    allowed = config.agreement * graph.cell + config.sequence_agreement * np.hypot(*travelled[:2])
+    frame, match, shift, _ = state.log.members(state.log.sequences - 1)[0]
+    remembered, travelled = _motions(state, Candidate(frame, match, shift, 0.0, 0.0), candidate)
+    allowed = config.agreement * state.cell + config.sequence_agreement * np.hypot(*travelled[:2])
     rotation = abs(wrap(remembered[2] - travelled[2]))
     return bool(np.hypot(*(remembered - travelled)[:2]) < allowed and rotation < 2 * config.agreement_heading)
 
 
-def has_same_heading(graph: KeyframeGraph, candidate: Candidate) -> bool:
+def has_same_heading(state: MapState, candidate: Candidate) -> bool:
     """Whether the headings of a closure agree by odometry: a robot that has turned is in another
     experience, even if its view changes little with heading."""
-    pose, turn = graph.pose.rows, -candidate.shift * graph.sector_angle
+    pose, turn = state.pose.rows, -candidate.shift * state.sector_angle
     turned = wrap(pose[candidate.keyframe, 2] - pose[candidate.match, 2])
     drift = abs(wrap(turned - turn))
-    return bool(np.cos(turn) > 0 and drift < graph.config.agreement_heading * graph.config.max_turn)
+    return bool(np.cos(turn) > 0 and drift < state.config.agreement_heading * state.config.max_turn)
 
 
 def judge_by_map(
-    graph: KeyframeGraph, covariance: MapCovariance, member: np.ndarray
+    state: MapState, covariance: MapCovariance, member: np.ndarray
 ) -> tuple[float, float, float, float]:
     """How the map judges the place of a closure (keyframe, match, shift).
 
@@ -61,12 +61,12 @@ def judge_by_map(
         deviations of the map's own relative pose, of position (m) and heading (rad).
     """
     j, i, shift = (int(value) for value in member[:3])
-    config, poses, turn = graph.config, graph.pose.rows, -shift * graph.sector_angle
+    config, poses, turn = state.config, state.pose.rows, -shift * state.sector_angle
     own = covariance.relative(i, j, turn)
-    gate = config.gate_sd * graph.cell
+    gate = config.gate_sd * state.cell
     allowed = own + np.diag([gate**2, gate**2, config.gate_heading**2])
     origin = turn_on_spot(poses[i], turn)
-    claims = between(origin, compose(poses[: max(j - graph.guard, i + 1)], np.array([0.0, 0.0, turn])))
+    claims = between(origin, compose(poses[: max(j - state.guard, i + 1)], np.array([0.0, 0.0, turn])))
     error = claims - between(origin, poses[j])
     error[:, 2] = wrap(error[:, 2])
     distance = np.einsum("na,ab,nb->n", error, np.linalg.inv(allowed), error)
@@ -76,21 +76,21 @@ def judge_by_map(
     return float(ratio), float(distance[i]), float(position), float(heading)
 
 
-def _motions(graph: KeyframeGraph, first: Candidate, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
+def _motions(state: MapState, first: Candidate, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
     """[3] motion from one candidate to a later one: between the remembered poses, and in the map."""
-    pose, angle = graph.pose.rows, graph.sector_angle
+    pose, angle = state.pose.rows, state.sector_angle
     start, end = (turn_on_spot(pose[one.match], -one.shift * angle) for one in (first, candidate))
     return between(start, end), between(pose[first.keyframe], pose[candidate.keyframe])
 
 
-def map_distance(graph: KeyframeGraph, log: ClosureLog, candidate: Candidate) -> float:
+def map_distance(state: MapState, candidate: Candidate) -> float:
     """Squared Mahalanobis distance of the candidate's claim from the map."""
-    turn = -candidate.shift * graph.sector_angle
-    pose = graph.pose.rows
+    turn = -candidate.shift * state.sector_angle
+    pose = state.pose.rows
     error = between(turn_on_spot(pose[candidate.match], turn), pose[candidate.keyframe])
-    gate = graph.config.gate_sd * graph.cell
-    least = np.diag([gate**2, gate**2, graph.config.gate_heading**2])
-    allowed = graph.map_covariance(log).relative(candidate.match, candidate.keyframe, turn) + least
+    gate = state.config.gate_sd * state.cell
+    least = np.diag([gate**2, gate**2, state.config.gate_heading**2])
+    allowed = state.covariance().relative(candidate.match, candidate.keyframe, turn) + least
     return float(error @ np.linalg.solve(allowed, error))
 
 
@@ -98,35 +98,16 @@ SEARCH = 400
 """Number of keyframes among which a break is searched."""
 
 
-def break_odometry(graph: KeyframeGraph, log: ClosureLog, sequence: int) -> None:
-    """Cuts the odometry where the views show the break, and joins the parts by the sequence."""
-    members, pose = log.members(sequence), graph.pose.rows
-    middle = members[len(members) // 2]
-    found = turn_on_spot(pose[middle[1]], -middle[2] * graph.sector_angle)
-    carried = compose(found, inverse(pose[middle[0]]))
-    # The first keyframe whose views fit better at the poses moved by `carried` [3].
-    first = int(members[0, 0])
-    anchored = log.table()[log.accepted_rows(), 0]
-    began = int(np.flatnonzero(graph.begins.rows[: first + 1]).max(initial=0))
-    since = max(int(anchored[anchored < first].max(initial=0)) - graph.config.max_gap, began)
-    frames = np.arange(max(since, first - SEARCH, 1), first + 1)
-    at = _find_turning_point(graph, frames, graph.pose.rows, graph.pose.rows[frames], carried)
-    graph.cut.rows[at] = sequence
-    pose[at:] = compose(carried, pose[at:])
-    log.reject(at, sequence)
-    log.judge(sequence, Verdict.ACCEPTED)
-
-
 def find_break(
-    graph: KeyframeGraph, poses: np.ndarray, onwards: np.ndarray, carried: np.ndarray, since: int
+    state: MapState, poses: np.ndarray, onwards: np.ndarray, carried: np.ndarray, since: int
 ) -> int:
     """The keyframe before which the odometry is cut; see `closure_selection.FindCut`."""
     frames = np.arange(since + 1, since + 1 + len(onwards))[-SEARCH:]
-    return _find_turning_point(graph, frames, poses, onwards[-SEARCH:], carried)
+    return find_turning_point(state, frames, poses, onwards[-SEARCH:], carried)
 
 
-def _find_turning_point(
-    graph: KeyframeGraph, frames: np.ndarray, poses: np.ndarray, onwards: np.ndarray, carried: np.ndarray
+def find_turning_point(
+    state: MapState, frames: np.ndarray, poses: np.ndarray, onwards: np.ndarray, carried: np.ndarray
 ) -> int:
     """The keyframe of `frames` [n] from which views fit better at the carried poses than at the odometry's.
 
@@ -136,9 +117,9 @@ def _find_turning_point(
     misfits = np.zeros((2, len(frames)))  # of the keyframes where they stay and where they are carried
     for row, own in zip(misfits, (onwards, compose(carried, onwards)), strict=True):
         for k, (frame, pose) in enumerate(zip(frames.tolist(), own, strict=True)):
-            old = poses[: max(frame - graph.guard, 0)]
-            near = np.flatnonzero(np.hypot(*(old - pose)[:, :2].T) < 1.5 * graph.cell)
-            row[k] = graph.least_misfit(frame, near, np.cos(old[near, 2] - pose[2]) < 0)
+            old = poses[: max(frame - state.guard, 0)]
+            near = np.flatnonzero(np.hypot(*(old - pose)[:, :2].T) < 1.5 * state.cell)
+            row[k] = state.least_misfit(frame, near, np.cos(old[near, 2] - pose[2]) < 0)
     stays, goes = misfits
     # With a break before frames[k], those before k stay and the others are carried.
     cost = np.concatenate([[0], np.cumsum(stays)[:-1]]) + np.cumsum(goes[::-1])[::-1]

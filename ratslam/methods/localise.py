@@ -17,7 +17,7 @@ from ratslam.core.session import finite_values
 from ratslam.mapping.ground import SESSION_WEIGHTING
 from ratslam.mapping.map import KeyframeMap
 from ratslam.methods.config import LocaliseBackendConfig
-from ratslam.methods.finished_map import restore_map
+from ratslam.methods.map_file import restore_map
 from ratslam.methods.recall import RecallBackend
 from ratslam.network.pose_cells import Belief
 from ratslam.places.localiser import Localiser, Place
@@ -82,9 +82,9 @@ class LocaliseBackend(Backend):
 
     def __init__(self, recall: RecallBackend, map: KeyframeMap, log_odds: float, here: bool = False) -> None:
         self._recall, self._log_odds = recall, log_odds
-        self._views = views = MapViews(recall, map.kept_keyframes())
-        poses = map.solution().fit.poses  # those of trajectory.tum and map.json
-        frames = map.kept_keyframes().taken.rows
+        self._views = views = MapViews(recall, map.state)
+        poses = map.solution().pose.rows  # those of trajectory.tum and map.json
+        frames = map.state.taken.rows
         self._memory = views.freeze(frames, poses[frames])
         every = np.arange(len(poses))
         odds = views.odds(every, poses, SESSION_WEIGHTING, np.isin(every, frames))
@@ -149,7 +149,7 @@ def build(config: LocaliseBackendConfig, view_shape: tuple[int, int, int], dtype
     """
     settings, recall = config.localise, RecallBackend(config, view_shape, dtype)
     map = restore_map(settings, recall.new_map(), "recall")
-    if not map.kept_keyframes().count:
+    if not map.state.count:
         expected = "a map in which a session can be found"
         raise InputError(str(settings.map), "a map without keyframes", expected)
     return LocaliseBackend(recall, map, settings.log_odds or LOG_ODDS, settings.start == "here")

@@ -18,7 +18,7 @@ from ratslam.grid.localiser import GridLocaliser, Hypotheses, Search
 from ratslam.grid.map import GridMap
 from ratslam.methods import grid
 from ratslam.methods.config import GridLocaliseBackendConfig
-from ratslam.methods.finished_map import restore_map
+from ratslam.methods.map_file import restore_map
 from tactile.base.errors import InputError
 from tactile.base.types import Array, MotionKind, Observation
 from tactile.whisker_geometry import PlanarWhiskers

@@ -31,10 +31,10 @@ from ratslam.mapping.appearance import (
     ViewAppearance,
     WhiskerAppearance,
 )
-from ratslam.mapping.archive import Archive
 from ratslam.mapping.config import FULL, Ablation
-from ratslam.mapping.keyframe_graph import KeyframeGraph, piece_start
 from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.map_state import MapState
+from ratslam.mapping.pieces import piece_start
 from ratslam.methods.config import RecallBackendConfig
 from ratslam.network import pose_cells
 from ratslam.network.config import Network
@@ -196,17 +196,17 @@ class RecallBackend(Backend):
     def state_of(self, map: Map, capacity: int) -> RecallState:
         """The keyframes of a map and the motion since the newest; all of the belief is novelty."""
         assert isinstance(map, KeyframeMap)
-        state, graph = self.init(None, capacity), map.kept_keyframes()
-        if not graph.count:
+        state = self.init(None, capacity)
+        if not map.state.count:
             return state
-        state = self.remember(graph, state)
+        state = self.remember(map.state, state)
         motion, length, turn = (jnp.array(value, self.dtype) for value in map.travel)
         return state._replace(memory=state.memory._replace(motion=motion, length=length, turn=turn))
 
-    def remember(self, graph: KeyframeGraph, state: RecallState) -> RecallState:
-        """The state, which has room for them, with all keyframes of a graph that are not merged; all of its
+    def remember(self, kept: MapState, state: RecallState) -> RecallState:
+        """The state, which has room for them, with all keyframes of a map that are not merged; all of its
         belief is novelty."""
-        frozen = MapViews(self, graph).freeze(graph.taken.rows, graph.pose.rows, state.memory.label.shape[0])
+        frozen = MapViews(self, kept).freeze(kept.taken.rows, kept.pose.rows, state.memory.label.shape[0])
         return self.begin_piece(state)._replace(memory=frozen, health=state.health)
 
     def no_belief(self, capacity: int) -> Belief:
@@ -315,8 +315,8 @@ class RecallBackend(Backend):
             appearance = ViewAppearance(self.size, fan, self._normalise)
         # By odds for views and given ids; with whiskers, sequences are selected against each other.
         by_odds = self.pixels is None and self.ablation.verify
-        acceptance: Callable[[KeyframeGraph, Archive], Acceptance]
-        acceptance = AcceptByOdds if by_odds else lambda graph, archive: AcceptByEvidence()
+        acceptance: Callable[[MapState], Acceptance]
+        acceptance = AcceptByOdds if by_odds else lambda state: AcceptByEvidence()
         return KeyframeMap(
             self.config.keyframes, self.cell, appearance, acceptance, guard=self.recall.guard,
             closures=self.config.experience.closures, ablation=self.ablation, find_tie=PieceTies(self),

@@ -148,7 +148,7 @@ def session_changes(place: Place, visits: Visits, head: Head, tallest: float) ->
         return []
 
     def contacts_of(frames: np.ndarray) -> ContactMap:
-        ground = place.ground._replace(poses=place.map.solution().fit.poses[frames])
+        ground = place.ground._replace(poses=place.map.solution().pose.rows[frames])
         levels = appearance.stored(frames)[0].astype(int)
         return ContactMap(ground, levels, appearance.layout, likeness, head, tallest)
 
@@ -156,10 +156,10 @@ def session_changes(place: Place, visits: Visits, head: Head, tallest: float) ->
     count = np.full(len(visits.step), len(place.frames))
     signs = contact_signs(contacts_of(place.frames), visits.pose, visits.view.astype(int), count)
     # Signs in the map itself: its later two thirds, each keyframe compared with those long before it.
-    graph = place.map.keyframes()
-    late = np.arange(graph.count // 3, graph.count)
-    own = contacts_of(np.arange(graph.count))
-    revisits = contact_signs(own, own.ground.poses[late], own.levels[late], late - graph.guard)
+    state = place.map.state
+    late = np.arange(state.total // 3, state.total)
+    own = contacts_of(np.arange(state.total))
+    revisits = contact_signs(own, own.ground.poses[late], own.levels[late], late - state.guard)
     return find_changes(signs, learn_chance(revisits, radius), radius)
 
 

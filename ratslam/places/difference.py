@@ -22,10 +22,10 @@ accepted ones."""
 
 def keyframe_content(map: KeyframeMap) -> MapContent:
     """The content of a keyframe map: a keyframe is known by its view and by the odometry into it."""
-    graph, solution = map.keyframes(), map.solution()
-    names = _contents(map, graph.motion.rows, graph.length.rows, graph.turn.rows)
+    solution = map.solution()
+    names = _contents(map, solution.motion.rows, solution.length.rows, solution.turn.rows)
     closures = solution.log.table()[solution.log.accepted_rows(), :2].astype(int)
-    return solution.fit.poses, names, closures
+    return solution.pose.rows, names, closures
 
 
 def difference(first: MapContent, second: MapContent) -> dict[str, float]:
@@ -74,7 +74,7 @@ def _pairs(closures: np.ndarray, common: np.ndarray, count: int) -> set[tuple[in
 
 def _contents(map: KeyframeMap, *odometry: np.ndarray) -> list[bytes]:
     """[N] the bytes of odometry [N, ...], view and place label of each keyframe."""
-    views, labels = map.appearance.stored(np.arange(map.keyframes().count))
+    views, labels = map.appearance.stored(np.arange(map.state.total))
     rows = zip(np.column_stack(odometry), np.asarray(views), labels, strict=True)
     return [motion.tobytes() + view.tobytes() + label.tobytes() for motion, view, label in rows]
 
@@ -94,8 +94,8 @@ where equal names are equal keyframes; and the steps [N] at which the keyframes 
 def remembered(map: KeyframeMap) -> Remembered:
     """The keyframes of a map. They are named by view, place label, distance and turn by odometry, which stay
     as they are when a map is continued, corrected, cropped or merged."""
-    graph, first = map.keyframes(), dict[bytes, int]()
-    for number, content in enumerate(_contents(map, graph.length.rows, graph.turn.rows)):
+    state, first = map.state.unmerged, dict[bytes, int]()
+    for number, content in enumerate(_contents(map, state.length.rows, state.turn.rows)):
         first.setdefault(blake2b(content, digest_size=16).digest(), number)
     return first, map.keyframe_steps()
 

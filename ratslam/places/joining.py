@@ -14,12 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.mapping.closure_selection import MapHypotheses
 from ratslam.mapping.ground import MAP_WEIGHTING, Ground, Motion
-from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.loop_closures import Candidate, Verdict
+from ratslam.mapping.loop_closures import Candidate
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.map_solution import MapSolution, selected_solution
+from ratslam.mapping.map_solution import solution_with
+from ratslam.mapping.map_state import MapState
 from ratslam.mapping.optimizer import MapCovariance
 from ratslam.places.hypotheses import Path
 from ratslam.places.map_views import MapViews
@@ -105,15 +104,15 @@ def join_all(
         # Merges keyframes on ground that the closures of a finished map confirm.
         config = map.config
         if config.merge_stood:
-            map.log.confirm(config.merge_stood)
-            map.merger.merge_all(map.kept_keyframes(), map.log, map.selection, 1)
+            map.state.log.confirm(config.merge_stood)
+            map.merger.merge_all(map.state, map.selection, 1)
     return joins
 
 
 def _join_some(map: KeyframeMap, views: MapViews, tried: Tried, report: Callable[[str], None]) -> Join | None:
     """Joins the first two pieces that can be joined, of those that were not tried yet."""
-    graph = map.kept_keyframes()
-    piece, stretch = graph.pieces(map.log), np.cumsum(graph.begins.rows)
+    state = map.state
+    piece, stretch = state.pieces(), np.cumsum(state.begins.rows)
     for pair in combinations(range(int(piece.max()) + 1), 2):
         one, other = (np.flatnonzero(piece == number) for number in pair)
         held = tuple(np.unique(stretch[one]).tolist()), tuple(np.unique(stretch[other]).tolist())
@@ -129,44 +128,32 @@ def _join_some(map: KeyframeMap, views: MapViews, tried: Tried, report: Callable
 
 def _join(map: KeyframeMap, views: MapViews, one: np.ndarray, other: np.ndarray) -> Join | None:
     """Joins two pieces of keyframes `one` [N] and `other` [n] if the evidence suffices."""
-    graph = map.kept_keyframes()
+    state = map.state
     found = _place(map, views, one, other)
     back = found and _place(map, views, other, one)
     if not found or not back:
         return None
     # Both placements, of either piece in the other, have to be the same.
-    own = graph.pose.rows[found.frames][found.on]
+    own = state.pose.rows[found.frames][found.on]
     apart = between(compose(found.motion, own), compose(inverse(back.motion), own))
     if not _is_small(found.ground, apart):
         return None
     if max(found.common, back.common) < COMMON:
         return None
-    sequences = _closures(graph, views, found)
-    start = compose(found.motion, graph.pose.rows[other[0]])
-    trial, log = graph.copy(), map.log.copy()
+    sequences = _closures(state, views, found)
+    start = compose(found.motion, state.pose.rows[other[0]])
+    trial = state.copy()
     trial.pose.rows[other] = compose(found.motion, trial.pose.rows[other])
-    # The map with these closures, selected together with all others where sequences are selected.
-    first, selected = log.sequences, None
-    for sequence in sequences:
-        log.add_accepted(sequence)
-    trial.optimise(log)
-    if trial.config.select_every:
-        hypotheses = MapHypotheses()
-        hypotheses.begin(trial.fit(), log.sequences)
-        selected = selected_solution(trial, log, hypotheses)
-    solution = selected or MapSolution.solved(trial, log)
-    new = np.arange(log.sequences) >= first
-    standing = new & (solution.log.verdicts() == Verdict.ACCEPTED)
-    scores = solution.log.scores()
-    if not new.any() or scores[standing].sum() < STANDING * scores[new].sum():
+    solution = solution_with(trial, sequences, STANDING)
+    if solution is None:
         return None
     _take_up(map, solution, sequences)
     middle = sequences[len(sequences) // 2][0]
     # The pieces are held together here: what lies `LOOSE` apart cannot be compared in double precision.
-    problem, piece = graph.problem(map.log, graph.cut), graph.pieces(map.log)
+    problem, piece = state.problem(), state.pieces()
     joined = np.where((piece[1:] != piece[:-1])[:, None], 1.0, problem.chain.variance)
     problem = problem._replace(chain=problem.chain._replace(variance=joined))
-    covariance = MapCovariance(graph.fit(), problem).relative(middle.match, middle.keyframe, 0.0)
+    covariance = MapCovariance(state.fit(), problem).relative(middle.match, middle.keyframe, 0.0)
     log_odds, needed = (found.log_odds, back.log_odds), (found.needed, back.needed)
     count = sum(len(sequence) for sequence in sequences)
     return Join(((), ()), start, np.sqrt(np.diag(covariance)), log_odds, needed, count)
@@ -175,13 +162,12 @@ def _join(map: KeyframeMap, views: MapViews, one: np.ndarray, other: np.ndarray)
 def _place(map: KeyframeMap, views: MapViews, onto: np.ndarray, frames: np.ndarray) -> _Found | None:
     """The placement of keyframes `frames` [n] on the ground of those `onto` [N] and of all merged with these,
     if it is beyond doubt."""
-    graph, archive = map.kept_keyframes(), map.archive
-    own = graph.pose.rows[frames]
-    every = np.flatnonzero(np.isin(archive.row.rows, onto)) if archive.begun else graph.taken.rows[onto]
-    poses = archive.poses(graph.pose.rows)[every]
+    state = map.state
+    own, every = state.pose.rows[frames], state.merged_into(onto)
+    poses = state.unmerged_poses()[every]
     ground, odds = views.ground(poses), views.odds(every, poses, MAP_WEIGHTING)
-    motions = _motions(graph, own)
-    session = Traverse(_compare(graph, views, every, poses, frames), motions, MIN_LOG_ODDS, own)
+    motions = _motions(state, own)
+    session = Traverse(_compare(state, views, every, poses, frames), motions, MIN_LOG_ODDS, own)
     paths = []
     for path in find_placements(ground, odds, session):
         # No evidence against it at headings that the other session never drove, and less in runs beside its
@@ -205,17 +191,17 @@ def _place(map: KeyframeMap, views: MapViews, onto: np.ndarray, frames: np.ndarr
 
 
 def _compare(
-    graph: KeyframeGraph, views: MapViews, taken: np.ndarray, poses: np.ndarray, frames: np.ndarray
+    state: MapState, views: MapViews, taken: np.ndarray, poses: np.ndarray, frames: np.ndarray
 ) -> Comparison:
     """The views of keyframes `frames` [n] on those numbered `taken` [M] of all, at `poses` [M, 3]."""
-    motion = np.array([moved.motion for moved in _motions(graph, graph.pose.rows[frames])])
-    return views.compare(views.freeze(taken, poses), graph.taken.rows[frames], motion)
+    motion = np.array([moved.motion for moved in _motions(state, state.pose.rows[frames])])
+    return views.compare(views.freeze(taken, poses), state.taken.rows[frames], motion)
 
 
-def _motions(graph: KeyframeGraph, poses: np.ndarray) -> list[Motion]:
+def _motions(state: MapState, poses: np.ndarray) -> list[Motion]:
     """The motions into keyframes of a solved map at `poses` [n, 3]."""
     motion = between(poses[np.maximum(np.arange(len(poses)) - 1, 0)], poses)
-    variance = SOLVED * graph.odometry_variance(np.hypot(*motion[:, :2].T), np.abs(motion[:, 2]))
+    variance = SOLVED * state.odometry_variance(np.hypot(*motion[:, :2].T), np.abs(motion[:, 2]))
     return [Motion(*one) for one in zip(motion, variance, strict=True)]
 
 
@@ -225,39 +211,38 @@ def _is_small(ground: Ground, apart: np.ndarray) -> bool:
     return bool(far < 2 * ground.reach and turned < ground.reach_heading)
 
 
-def _closures(graph: KeyframeGraph, views: MapViews, found: _Found) -> list[list[Candidate]]:
+def _closures(state: MapState, views: MapViews, found: _Found) -> list[list[Candidate]]:
     """Closure sequences along a placement, with keyframes that are not merged."""
-    poses = graph.pose.rows[found.onto]
-    compared = _compare(graph, views, graph.taken.rows[found.onto], poses, found.frames)
+    poses = state.pose.rows[found.onto]
+    compared = _compare(state, views, state.taken.rows[found.onto], poses, found.frames)
     ground = views.ground(poses)
     sequences: list[list[Candidate]] = []
-    last = -graph.config.max_gap - 1
+    last = -state.config.max_gap - 1
     for k, match in closures_along(ground, compared, found.path):
         if not found.on[k]:
             continue
-        if k - last > graph.config.max_gap:
+        if k - last > state.config.max_gap:
             sequences.append([])
         # The closure of the later with the earlier keyframe, which face `turn` (rad) from each other.
         frame, other = int(found.frames[k]), int(found.onto[match.frame])
-        turn, angle = float(ground.turns[match.shift]), graph.sector_angle
+        turn, angle = float(ground.turns[match.shift]), state.sector_angle
         if frame < other:
             frame, other, turn = other, frame, -turn
         shift = round(-turn / angle) if angle else 0
-        if graph.half_turns:  # half a turn is the same either way
+        if state.half_turns:  # half a turn is the same either way
             shift = abs(shift)
         posterior = float(1 / (1 + np.exp(-match.gain)))
         sequences[-1].append(Candidate(frame, other, shift, posterior, match.gain))
         last = k
-    return [sequence for sequence in sequences if len(sequence) >= graph.config.min_length]
+    return [sequence for sequence in sequences if len(sequence) >= state.config.min_length]
 
 
-def _take_up(map: KeyframeMap, solution: MapSolution, sequences: list[list[Candidate]]) -> None:
-    graph, log = map.kept_keyframes(), map.log
+def _take_up(map: KeyframeMap, solution: MapState, sequences: list[list[Candidate]]) -> None:
+    state = map.state
     for sequence in sequences:
-        map.add_accepted(sequence)
-    log.follow(solution.log)
-    graph.pose.rows[:] = solution.fit.poses
-    graph.bias, graph.turn_error = solution.fit.bias, solution.fit.turn_error
-    graph.cut.replace(solution.cut.rows)
-    graph.place_pieces(log)
-    map.selection.hypotheses.begin(graph.fit(), log.sequences)
+        state.add_accepted(sequence)
+    state.log.follow(solution.log)
+    state.take_fit(solution.fit())
+    state.cut.replace(solution.cut.rows)
+    state.place_pieces()
+    map.selection.hypotheses.begin(state.fit(), state.log.sequences)

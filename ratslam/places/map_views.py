@@ -16,11 +16,10 @@ import numpy as np
 from jax import lax
 
 from ratslam.core.session import capacity_at
-from ratslam.mapping.archive import Archive
+from ratslam.mapping.acceptance import Tie
 from ratslam.mapping.ground import PIECE_WEIGHTING, GainOdds, GainWeighting, Ground, LearnedOdds, Motion
-from ratslam.mapping.keyframe_graph import KeyframeGraph
-from ratslam.mapping.loop_closures import Candidate, ClosureLog
-from ratslam.mapping.map import Tie
+from ratslam.mapping.loop_closures import Candidate
+from ratslam.mapping.map_state import MapState
 from ratslam.network.pose_cells import Belief, Network
 from ratslam.places.localiser import compare_with_itself
 from ratslam.places.placement import Comparison, Traverse, closures_along, find_placements
@@ -64,11 +63,11 @@ class MapViews:
     """The views of a finished map, compared with each other or with those of a session.
 
     Args:
-        recall: the backend that made the map. graph: its keyframes.
+        recall: the backend that made the map. state: its keyframes.
     """
 
-    def __init__(self, recall: ViewMatcher, graph: KeyframeGraph) -> None:
-        self.recall, self.graph = recall, graph
+    def __init__(self, recall: ViewMatcher, state: MapState) -> None:
+        self.recall, self.state = recall, state
         # No keyframe of a finished map is too new to be recalled.
         self.config = recall.recall.model_copy(update={"guard": 0})
         self.shifts = sector_shifts(self.config)
@@ -81,17 +80,17 @@ class MapViews:
         Args:
             capacity: rows; 0: as many as it takes.
         """
-        recall, graph = self.recall, self.graph
-        feedback = MapFeedback(poses, graph.bias, graph.turn_error, 0.0, *graph.appearance.metric())
-        views, labels = graph.appearance.stored(frames)
+        recall, state = self.recall, self.state
+        feedback = MapFeedback(poses, state.bias, state.turn_error, 0.0, *state.appearance.metric())
+        views, labels = state.appearance.stored(frames)
         capacity = capacity or capacity_at(len(labels))
         empty = init_memory(self.config, views.shape[1], capacity, recall.dtype, recall.groups)
         return empty.filled(feedback, views, labels)
 
     def ground(self, poses: np.ndarray) -> Ground:
         """Keyframes at `poses` [N, 3] as ground."""
-        angle, variance = self.graph.sector_angle, self.graph.closure_variance()
-        share = self.graph.appearance.NEAR_SHARE
+        angle, variance = self.state.sector_angle, self.state.closure_variance()
+        share = self.state.appearance.NEAR_SHARE
         return Ground.of(poses, self.shifts, self.recall.cell, angle, variance, share)
 
     def odds(
@@ -106,7 +105,7 @@ class MapViews:
         """
         held = np.ones(len(frames), bool) if held is None else held
         whole, guard = self.freeze(frames[held], poses[held]), self.recall.recall.guard
-        views, labels = self.graph.appearance.stored(frames)
+        views, labels = self.state.appearance.stored(frames)
 
         def gains(begin: int, count: int) -> np.ndarray:
             earlier = whole.first_keyframes(int(held[: begin - guard].sum()))
@@ -114,7 +113,7 @@ class MapViews:
             label = jnp.asarray(labels[begin : begin + count].astype(np.int32))
             return np.asarray(self._gains(earlier, view, label))
 
-        weighing = weighing._replace(prior=self.graph.appearance.gain_prior(weighing.prior))
+        weighing = weighing._replace(prior=self.state.appearance.gain_prior(weighing.prior))
         return compare_with_itself(self.ground(poses), guard, gains, weighing, held)
 
     def compare(self, memory: Memory, frames: np.ndarray, motion: np.ndarray) -> Comparison:
@@ -123,7 +122,7 @@ class MapViews:
         Args:
             motion: [n, 3] into each of them, without systematic errors, m, m, rad.
         """
-        views, labels = self.graph.appearance.stored(frames)
+        views, labels = self.state.appearance.stored(frames)
         count, parts = int(memory.count), []
         dtype, memory = memory.view.dtype, memory._replace(bias=jnp.zeros_like(memory.bias))
         memory = memory._replace(turn_error=jnp.zeros_like(memory.turn_error))
@@ -220,49 +219,45 @@ class PieceTies:
         self._recall = recall
         self._views: MapViews | None = None
 
-    def __call__(
-        self, graph: KeyframeGraph, log: ClosureLog, archive: Archive, odds: LearnedOdds
-    ) -> Tie | None:
+    def __call__(self, state: MapState, odds: LearnedOdds) -> Tie | None:
         """The best placement of the keyframes since the newest beginning on one of the pieces before."""
-        begin = int(np.flatnonzero(graph.begins.rows)[-1])
-        own, piece = np.arange(begin, graph.count), graph.pieces(log)[:begin]
+        begin = int(np.flatnonzero(state.begins.rows)[-1])
+        own, piece = np.arange(begin, state.count), state.pieces()[:begin]
         if len(own) < FEWEST:
             return None
-        if self._views is None or self._views.graph is not graph:
-            self._views = MapViews(self._recall, graph)
+        if self._views is None or self._views.state is not state:
+            self._views = MapViews(self._recall, state)
         found: list[Tie] = []
         for number in np.unique(piece).tolist():
             frames = np.flatnonzero(piece == number)
             if len(frames) >= FEWEST:
-                found += _place_on(self._views, archive, odds, own, frames)
+                found += _place_on(self._views, odds, own, frames)
         if not found:
             return None
         (log_odds, closures), *others = sorted(found, key=lambda tie: -tie[0])
         ahead = log_odds - (others[0][0] if others else -np.inf)
-        return (log_odds if ahead >= graph.config.tie_log_odds / 2 else ahead), closures
+        return (log_odds if ahead >= state.config.tie_log_odds / 2 else ahead), closures
 
 
-def _place_on(
-    views: MapViews, archive: Archive, odds: LearnedOdds, own: np.ndarray, frames: np.ndarray
-) -> list[Tie]:
+def _place_on(views: MapViews, odds: LearnedOdds, own: np.ndarray, frames: np.ndarray) -> list[Tie]:
     """All placements of the keyframes `own` [n] of the newest piece on those of an older one, `frames`
     [N]."""
-    graph = views.graph
-    taken, poses = graph.taken.rows[frames], graph.pose.rows[frames]
+    state = views.state
+    taken, poses = state.taken.rows[frames], state.pose.rows[frames]
 
     def learn() -> GainOdds:
-        every = np.flatnonzero(np.isin(archive.row.rows, frames)) if archive.begun else taken
+        every = state.merged_into(frames)
         held = np.isin(every, taken)
-        return views.odds(every, archive.poses(graph.pose.rows)[every], PIECE_WEIGHTING, held)
+        return views.odds(every, state.unmerged_poses()[every], PIECE_WEIGHTING, held)
 
     ground, memory = views.ground(poses), views.freeze(taken, poses)
     learned = odds.of((len(frames), int(taken[0]), int(taken[-1])), learn)
     # Odometry into each keyframe of the piece without its systematic errors.
-    motion = graph.correct(graph.motion.rows[own], graph.length.rows[own])
-    variance = graph.odometry_variance(graph.length.rows[own], graph.turn.rows[own])
-    variance[:, 2] *= graph.heading_noise.further_factor
+    motion = state.correct(state.motion.rows[own], state.length.rows[own])
+    variance = state.odometry_variance(state.length.rows[own], state.turn.rows[own])
+    variance[:, 2] *= state.heading_noise.further_factor
     motions = [Motion(*one) for one in zip(motion, variance, strict=True)]
-    compared = views.compare(memory, graph.taken.rows[own], np.array([m.motion for m in motions]))
+    compared = views.compare(memory, state.taken.rows[own], np.array([m.motion for m in motions]))
     places = float(np.log(max(ground.places(), 1.0)))
     session = Traverse(compared._replace(gain=PIECE_WEIGHTING.weigh(compared.gain)), motions)
     return [

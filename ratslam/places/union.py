@@ -11,10 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import with_prefix
-from ratslam.mapping.archive import Archive
 from ratslam.mapping.experiences import Experiences
-from ratslam.mapping.keyframe_graph import INTERRUPTED
 from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.map_state import INTERRUPTED
 from ratslam.mapping.optimizer import CalibrationPrior
 from ratslam.mapping.step_record import leading_to, settled
 from tactile.base.se2 import bend_motion, between
@@ -58,7 +57,7 @@ def unite(first: KeyframeMap, second: KeyframeMap, blank: KeyframeMap) -> Keyfra
     bend = Bend(_calibration(b), _calibration(a))
     united = a | _graph("graph/", a, b, (size, taken, sequences), bend)
     united |= _log("log/", a, b, size, sequences)
-    if first.archive.begun or second.archive.begun:
+    if first.state.merged or second.state.merged:
         one, other = _archived(first, a), _archived(second, b)
         pairs = other["pairs"].copy()
         pairs[:, :2] += taken
@@ -77,28 +76,18 @@ def unite(first: KeyframeMap, second: KeyframeMap, blank: KeyframeMap) -> Keyfra
     kept = {name: value for name, value in united.items() if not name.startswith(AFRESH)}
     blank.restore(blank.arrays() | kept)
     blank.appearance.extend(second.appearance)
-    graph, log = blank.kept_keyframes(), blank.log
-    blank.appearance.relearn(blank.archive.confirmed_pairs(graph, log))
-    graph.place_pieces(log)
-    graph.reckoned = graph.pose.rows[-1].copy()
-    blank.selection.hypotheses.begin(graph.fit(), log.sequences)
+    state = blank.state
+    blank.appearance.relearn(state.confirmed_pairs())
+    state.place_pieces()
+    state.reckoned = state.pose.rows[-1].copy()
+    blank.selection.hypotheses.begin(state.fit(), state.log.sequences)
     return blank
 
 
 def _finished(map: KeyframeMap) -> Arrays:
     """The arrays of a map with the poses and verdicts of its final solution."""
     map.solution()  # which the archive takes over
-    fit, log, broken = map.kept_solution()
-    return (
-        map.arrays()
-        | {f"log/{name}": value for name, value in log.arrays().items()}
-        | {
-            "graph/pose": fit.poses,
-            "graph/cut": broken.rows.copy(),
-            "graph/bias/0": np.array(fit.bias),
-            "graph/turn_error/0": np.array(fit.turn_error),
-        }
-    )
+    return map.arrays() | map.kept_solution().arrays()
 
 
 def _calibration(arrays: Arrays) -> CalibrationPrior:
@@ -108,11 +97,10 @@ def _calibration(arrays: Arrays) -> CalibrationPrior:
 
 def _archived(map: KeyframeMap, own: Arrays) -> Arrays:
     """The archive of a map, made of the map itself where no keyframe was merged."""
-    if map.archive.begun:
+    if map.state.merged:
         return with_prefix(own, "archive/")
-    count = len(own["graph/taken"])
-    archive = Archive(map.kept_keyframes())
-    rows = {"row": np.arange(count), "offset": np.zeros((count, 3)), "pairs": archive.pairs.rows.copy()}
+    count = map.state.count
+    rows = {"row": np.arange(count), "offset": np.zeros((count, 3)), "pairs": own["archive/pairs"]}
     return rows | {name: value for name, value in own.items() if name.startswith(("graph/", "log/"))}
 
 
@@ -166,12 +154,11 @@ def _steps(a: Arrays, b: Arrays, taken: int, bend: Bend) -> Arrays:
 def renew_experiences(map: KeyframeMap) -> None:
     """Forms the experiences of a finished map anew, so that pieces that were joined share those of their
     common ground."""
-    graph, poses = map.keyframes(), map.solution().fit.poses
+    poses, archive = map.solution().pose.rows, map.state.merged
     experiences = Experiences(map.config.place_radius * map.cell, map.config.place_heading)
-    for frame, begins in enumerate(graph.begins.rows.tolist()):
+    for frame, begins in enumerate(map.state.unmerged.begins.rows.tolist()):
         experiences.arrive(poses[: frame + 1], frame, -1, True, begins)
-    if map.archive.begun:
-        kept, archive = map.kept_keyframes().taken.rows, map.archive
-        experiences.merge(kept, archive.row.rows, archive.offset.rows)
+    if archive:
+        experiences.merge(map.state.taken.rows, archive.row.rows, archive.offset.rows)
     own = {f"experiences/{name}": value for name, value in experiences.arrays().items()}
     map.restore(map.arrays() | own)

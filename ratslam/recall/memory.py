@@ -47,24 +47,39 @@ class MapFeedback(NamedTuple):
 
 
 class MergedRows(NamedTuple):
-    """Rows of the memory after keyframes were merged or restored.
+    """Rows, of a map or of the memory, after keyframes were merged or restored: old row to new row.
 
     Attributes:
-        source: [n] the former row of each row, or the one that its keyframe was merged with. view: [n, D] and
-            label: [n] of their keyframes. onto: [N] the row that each former row now is or is merged with.
-            offset: [N, 3] its pose in the frame of that one, m, m, rad.
+        source: [n] the former row of each row, or the one that its keyframe was merged with. onto: [N] the
+            row that each former row now is or is merged with. offset: [N, 3] its pose in the frame of that
+            one, m, m, rad; zero for `source`. view: [n, D] and label: [n] of the keyframes, for the memory.
     """
 
     source: np.ndarray
-    view: np.ndarray
-    label: np.ndarray
     onto: np.ndarray
     offset: np.ndarray
+    view: np.ndarray = np.zeros((0, 0))
+    label: np.ndarray = np.zeros(0, np.int32)
+
+    @classmethod
+    def of_none(cls, count: int) -> MergedRows:
+        """All of `count` rows remain."""
+        return cls(np.arange(count), np.arange(count), np.zeros((count, 3)))
 
     @property
     def rows(self) -> int:
         """Number of rows thereafter."""
         return len(self.source)
+
+    def is_kept(self) -> np.ndarray:
+        """[N] bool, former rows that are merged with no other."""
+        kept = np.zeros(len(self.onto), bool)
+        kept[self.source] = True
+        return kept
+
+    def turned(self) -> np.ndarray:
+        """[N] bool: former rows whose keyframes face opposite to those that they are merged with."""
+        return np.cos(self.offset[:, 2]) < 0
 
 
 class CroppedRows(NamedTuple):

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from evaluation.artifacts.manifest import read_manifest
 from ratslam.core.session import Session
+from ratslam.methods.map_file import NAME, map_file
 from ratslam.methods.method_registry import LOCALISING
 from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.map_settings import Sensor, check_same_method
-from ratslam.runs.saved_map import NAME, map_file, read_map
+from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.source import Source
 from tactile.base.errors import InputError, tell

@@ -15,18 +15,18 @@ from ratslam.core.backend import Map
 from ratslam.core.session import Session
 from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.map_solution import Obstacle
+from ratslam.mapping.map_solution import Obstacle, obstacle
+from ratslam.methods.map_file import NAME, map_file
 from ratslam.methods.recall import RecallBackend
 from ratslam.places.crop import crop_map
 from ratslam.places.difference import difference, keyframe_content
-from ratslam.runs.folder_change import change_folder
 from ratslam.runs.map_results import rewrite_results
 from ratslam.runs.map_settings import flat_settings
-from ratslam.runs.saved_map import NAME, SavedMap, map_file, write_map
+from ratslam.runs.saved_map import SavedMap, write_map
 from ratslam.runs.settings.strict_yaml import dump
 from tactile.base.bounded import malformed
 from tactile.base.errors import InputError
-from tactile.base.files import make_new_file, require_writable
+from tactile.base.files import change_folder, make_new_file, require_writable
 
 CURES = {
     Obstacle.NOT_ACCEPTED: "`ratslam map info {path} --json` lists them",
@@ -70,10 +70,10 @@ def map_info(saved: SavedMap) -> dict[str, Any]:
 
 
 def _keyframe_info(made: KeyframeMap) -> dict[str, Any]:
-    kept, solution = made.kept_keyframes(), made.solution()
-    belief = made.keyframes().calibration(*solution)
+    solution = made.solution()
+    belief = solution.calibration()
     # Of the sequences of recall: those that may follow them in a final map follow from its poses.
-    verdicts = solution.log.verdicts()[: made.log.sequences]
+    verdicts = solution.log.verdicts()[: made.state.log.sequences]
     log, step = solution.log, made.keyframe_steps()
     accepted = []
     for number in np.flatnonzero(verdicts == Verdict.ACCEPTED).tolist():
@@ -84,12 +84,12 @@ def _keyframe_info(made: KeyframeMap) -> dict[str, Any]:
                 "steps": step[members[[0, -1], 0]].tolist(),
                 "match_steps": step[members[[0, -1], 1]].tolist(),
                 "evidence": round(log.score(number), 2),
-                "can_be_undone": solution.obstacle(number, made.log) is None,
+                "can_be_undone": obstacle(solution, number, made.state.log) is None,
             }
         )
     return {
-        "keyframes": made.keyframes().count,
-        "keyframes_not_merged": kept.count,
+        "keyframes": solution.count,
+        "keyframes_not_merged": made.state.count,
         "sequences": len(verdicts),
         "accepted_sequences": accepted,
         "sequences_undone": int((verdicts == Verdict.UNDONE).sum()),
@@ -140,11 +140,11 @@ def undo_sequence(saved: SavedMap, sequence: int, output: Path) -> bool:
             has no closure sequences, or a file of the run directory is missing or malformed.
     """
     session, made = _keyframe_session(saved, "undo")
-    obstacle = made.solution().obstacle(sequence, made.log)
-    if obstacle is not None:
+    against = obstacle(made.solution(), sequence, made.state.log)
+    if against is not None:
         expected = "an accepted sequence that can be undone"
-        cure = CURES[obstacle].format(path=saved.path)
-        raise InputError(str(saved.path), f"sequence {sequence} {obstacle}", expected, cure)
+        cure = CURES[against].format(path=saved.path)
+        raise InputError(str(saved.path), f"sequence {sequence} {against}", expected, cure)
     made.undo(sequence)
 
     def write(file: Path) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from evaluation.artifacts.run_reader import MERGE_REPORT as REPORT
 from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap
+from ratslam.methods.map_file import NAME, digest_of
 from ratslam.methods.recall import RecallBackend
 from ratslam.places.difference import overlap, remembered
 from ratslam.places.joining import Stretches, join_all
@@ -23,7 +24,7 @@ from ratslam.places.union import renew_experiences, unite
 from ratslam.runs.estimate import START
 from ratslam.runs.map_results import write_merged_results
 from ratslam.runs.map_settings import assignments, differing_settings, settings_of_map
-from ratslam.runs.saved_map import NAME, SavedMap, digest_of, read_map, write_map
+from ratslam.runs.saved_map import SavedMap, read_map, write_map
 from ratslam.runs.settings.strict_yaml import dump
 from tactile.base.errors import InputError
 from tactile.base.files import make_new_file, new_folder
@@ -53,12 +54,12 @@ def merge_maps(
     session = maps[0].open_session()
     made, backend = _keyframes_of(maps[0], session.map), session.backend
     assert isinstance(backend, RecallBackend)
-    before, owner = made.kept_keyframes().count, [0] * _stretches(made)
+    before, owner = made.state.count, [0] * _stretches(made)
     tried: set[tuple[Stretches, Stretches]] = set()
     joins: list[dict[str, Any]] = []
 
     def join() -> None:
-        for found in join_all(made, MapViews(backend, made.kept_keyframes()), tried, report):
+        for found in join_all(made, MapViews(backend, made.state), tried, report):
             measured = found._asdict()
             pieces = measured.pop("stretches")
             maps_of = [sorted({owner[stretch] for stretch in piece}) for piece in pieces]
@@ -68,13 +69,13 @@ def merge_maps(
     join()
     for number, saved in enumerate(maps[1:], 1):
         other = _keyframes_of(saved, saved.open_session().map)
-        before += other.kept_keyframes().count
+        before += other.state.count
         owner += [number] * _stretches(other)
         made = unite(made, other, backend.new_map())
         report(f"adding {saved.path}")
         join()
     renew_experiences(made)
-    session.map, kept, steps = made, made.kept_keyframes(), [saved.steps for saved in maps]
+    session.map, kept, steps = made, made.state, [saved.steps for saved in maps]
     session.change_rows(kept.count, sum(steps), partial(backend.remember, kept))
     piece, owners = made.pieces(), np.repeat(np.arange(len(maps)), steps)
     found = {
@@ -82,7 +83,7 @@ def merge_maps(
         "steps": steps,
         "joins": joins,
         "pieces": [np.unique(owners[piece == k]).tolist() for k in range(int(piece.max()) + 1)],
-        "keyframes": made.kept_keyframes().count,
+        "keyframes": made.state.count,
         "keyframes_before": before,
         "settings": differing_settings([saved.config for saved in maps]),
     }
@@ -125,7 +126,7 @@ def _names(maps: Sequence[int]) -> str:
 
 
 def _stretches(made: KeyframeMap) -> int:
-    return int(made.kept_keyframes().begins.rows.sum()) + 1
+    return int(made.state.begins.rows.sum()) + 1
 
 
 def _write(output: Path, session: Session, maps: Sequence[SavedMap], report: Mapping[str, Any]) -> None:
@@ -173,7 +174,7 @@ def check_mergeable(maps: Sequence[SavedMap]) -> None:
 
 def _keyframes_of(saved: SavedMap, made: object) -> KeyframeMap:
     """The map restored from a saved one; raises `InputError` if it has no keyframes."""
-    if not isinstance(made, KeyframeMap) or not made.kept_keyframes().count:
+    if not isinstance(made, KeyframeMap) or not made.state.count:
         found = f"a map of `backend: {saved.config.backend}` without keyframes"
         raise InputError(str(saved.path), found, "a map of `backend: recall` with keyframes")
     return made

@@ -27,6 +27,7 @@ from evaluation.metrics.trajectory import read_tum
 from ratslam.core.arrays import GrowableArray
 from ratslam.core.estimates import Action, GridDrawing, PoseCellActivity
 from ratslam.core.session import CHUNK, Session, Step
+from ratslam.methods.map_file import NAME, map_file
 from ratslam.methods.method_registry import BACKENDS, LOCALISING, BackendEntry
 from ratslam.runs.build_session import build_session
 from ratslam.runs.cell_recorder import CellRecorder, plan_recording
@@ -35,7 +36,7 @@ from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.map_results import score_and_plot, write_map_results
 from ratslam.runs.map_settings import Sensor
 from ratslam.runs.run_directory import OnlineErrorLog, RunDirectory, WhiskerView
-from ratslam.runs.saved_map import NAME, describe_readings, map_file, read_map, write_map
+from ratslam.runs.saved_map import describe_readings, read_map, write_map
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import dump
 from robot.recordings.input_judge import judge_motion

@@ -1,14 +1,8 @@
-"""Map files: the one place that reads and writes them.
-
-A map file (NumPy's .npz; `map.npz` of a run directory) holds the arrays of a session, the completed
-configuration, the description of the readings, and a sha256 over all of it.
-"""
+"""Saved maps: a session with its configuration and the description of its readings, in a map file
+(`ratslam.methods.map_file`)."""
 
 from __future__ import annotations
 
-import hashlib
-import stat
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,72 +12,20 @@ import numpy as np
 
 from ratslam.core.arrays import fill_missing, with_prefix
 from ratslam.core.session import UNKNOWN, Session
+from ratslam.methods.map_file import EXPECTED, FORMAT, FORMATS, digest_of, map_file, read_map_arrays
 from ratslam.methods.method_registry import BACKENDS, LOCALISING
 from ratslam.runs.build_session import build_session
 from ratslam.runs.estimate import START, PoseEstimate
-from ratslam.runs.folder_change import unfinished_change
 from ratslam.runs.map_settings import Sensor, check_same_settings
 from ratslam.runs.settings.renamed_keys import with_moved_settings
 from ratslam.runs.settings.run_config import LoopConfig, RunConfig
 from ratslam.runs.settings.strict_yaml import MAP, dump, kind_of, parse, validate
 from robot.sources.source import Source, SourceDescription, describe
 from robot.touch_source import TouchSource
-from tactile.base.bounded import NPZ_SPOILT, malformed, read_arrays, reason
+from tactile.base.bounded import NPZ_SPOILT, malformed, reason
 from tactile.base.errors import InputError
-from tactile.base.files import flush_to_disk, write_atomically
+from tactile.base.files import flush_to_disk, unfinished_change, write_atomically
 
-FORMAT = "ratslam-map-3"
-"""Name and version of the format; a later version reads it."""
-FORMATS = ("ratslam-map-1", "ratslam-map-2", FORMAT)
-"""The formats that are read. The first does not tell `Session.earlier`; the first two have no belief of pose
-cells."""
-EXPECTED = "a map: a run directory, its map.npz, or a file written by Slam.save"
-ARCHIVE = b"PK"
-"""Beginning of every map file, which distinguishes a damaged one from another file."""
-
-
-def _read_arrays(file: Path) -> dict[str, np.ndarray]:
-    """All arrays of a file that is a map by the names in it and by its size.
-
-    Raises:
-        InputError: it is no such file, damaged, of an unknown format, or cannot be read.
-    """
-    with malformed(file, EXPECTED, "check the path and its permissions"):
-        if not stat.S_ISREG(file.stat().st_mode):
-            raise InputError(str(file), "neither a file nor a folder", EXPECTED)
-        with file.open("rb") as opened:
-            begin = opened.read(len(ARCHIVE))
-    found = "damaged, or not a map ({})" if begin == ARCHIVE else "not a map"
-    found, cure = found if begin else "empty, so not a map", "restore it from a copy if it was one"
-    with malformed(file, EXPECTED, cure, found, NPZ_SPOILT), zipfile.ZipFile(file) as archive:
-        members = [name.removesuffix(".npy") for name in archive.namelist()]
-        if "steps" not in members:
-            raise InputError(str(file), "an archive of other arrays", EXPECTED)
-        if "format" in members:
-            (array,) = read_arrays(archive, ["format.npy"], str(file))
-            if array.shape or array.dtype.kind != "U" or str(array) not in FORMATS:
-                found = repr(str(array)[:40]) if not array.shape else "numbers"
-                cure = "update ratslam if a newer version wrote it"
-                raise InputError(str(file), f"the map format {found}", " or ".join(FORMATS), cure)
-        arrays = read_arrays(archive, archive.namelist(), str(file))
-        return dict(zip(members, arrays, strict=True))
-
-
-def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
-    """The sha256 (hex) over names, dtypes, shapes and bytes of all arrays, sorted by name, but `sha256`."""
-    digest = hashlib.sha256()
-    for name in sorted(set(arrays) - {"sha256"}):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name}\0{array.dtype.str}\0{arrays[name].shape}\0".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
-
-
-NAME = "map.npz"
-"""The map file of a run directory."""
-TEXTS = ("format", "config", "source", "recording", "sha256")
-"""Texts in a map file beside the arrays of the session: format, completed configuration (YAML), description
-of the readings (JSON), sha256 of the recording ('' without), and sha256 of all the others (`digest_of`)."""
 ESTIMATE, FRONTEND, STATE = "estimate/", "frontend/", "state/"
 CHANGED = ("recall", "localise")
 """Methods whose maps of earlier versions have another state: one without the belief of the pose cells."""
@@ -173,11 +115,6 @@ class SavedMap:
             raise InputError(str(self.path), found, expected, cure) from None
 
 
-def map_file(path: Path) -> Path:
-    """The map file of a run directory, or the file itself."""
-    return path / NAME if path.is_dir() else path
-
-
 def is_map(path: Path) -> bool:
     """Whether a path is a map by the names in its file."""
     return kind_of(map_file(path)) == MAP
@@ -198,17 +135,7 @@ def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMa
     if undone is not None and report is not None:
         cure = f"repeat `ratslam map undo {file.parent} {undone}` to complete it"
         report(f"{file.parent}: the undo of sequence {undone} was cut off; {cure}")
-    arrays = _read_arrays(file)
-    texts = {}
-    for name in TEXTS:
-        found = arrays.get(name)
-        if found is None or found.shape or found.dtype.kind != "U":
-            problem = f"a file without {name!r}" if found is None else f"{name!r} is not a text"
-            raise InputError(str(file), problem, EXPECTED)
-        texts[name] = str(found)
-    if digest_of(arrays) != texts["sha256"]:
-        problem = "damaged: the content does not match its sha256"
-        raise InputError(str(file), problem, "the file as it was written", "restore it from a copy")
+    arrays, texts = read_map_arrays(file)
     config = validate(with_moved_settings(parse(texts["config"], f"{file}: config")), LoopConfig)
     BACKENDS.get(config.backend, f"{file}: backend")
     if texts["format"] == FORMATS[0]:
@@ -224,8 +151,7 @@ def read_map(path: Path, report: Callable[[str], None] | None = None) -> SavedMa
         raise InputError(str(file), f"{steps} steps", EXPECTED)
     if not UNKNOWN <= earlier <= steps:
         raise InputError(str(file), f"{earlier} steps of earlier recordings among {steps}", EXPECTED)
-    own = {name: value for name, value in arrays.items() if name not in TEXTS}
-    session = {name: value for name, value in own.items() if not name.startswith((ESTIMATE, FRONTEND))}
+    session = {n: values for n, values in arrays.items() if not n.startswith((ESTIMATE, FRONTEND))}
     fill_missing(session)
     if texts["format"] != FORMAT:
         session["sides"] = np.zeros(0, np.int64)

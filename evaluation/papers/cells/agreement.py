@@ -1,6 +1,6 @@
 """The table of agreement: scores of recorded pose cells beside those of opexebo and pynapple.
 
-Each package gets the same maps in its own convention; `grid_score`, `border_score` and `mutual_information`
+Each package gets the same maps in its own convention; `grid_score`, `border_score` and `_mutual_information`
 call the packages so. They are also what the tests of `evaluation/cells` compare its scores with.
 """
 
@@ -116,7 +116,7 @@ def _beside_pynapple(pynapple: ModuleType, sums: BinnedSums) -> Iterator[_Pair]:
         ("place", rate_map.rate_maps(sums, 1.5), sums.seconds),
         ("heading", rate_map.tuning_curves(sums), sums.heading_seconds),
     ):
-        theirs = mutual_information(pynapple, rates, seconds)
+        theirs = _mutual_information(pynapple, rates, seconds)
         mine = information(rates, seconds), information_rate(rates, seconds)
         yield f"information, {what}", "pynapple", mine[0], theirs["bits/spike"]
         yield f"information rate, {what}", "pynapple", mine[1], theirs["bits/sec"]
@@ -173,7 +173,9 @@ def border_score(opexebo: ModuleType, maps: np.ndarray, fields: Fields, cell: in
         return float(opexebo.analysis.border_score(masked, labels, each, "square", search_width=width)[0])
 
 
-def mutual_information(pynapple: ModuleType, rates: np.ndarray, seconds: np.ndarray) -> dict[str, np.ndarray]:
+def _mutual_information(
+    pynapple: ModuleType, rates: np.ndarray, seconds: np.ndarray
+) -> dict[str, np.ndarray]:
     """pynapple's information of rates [C, ...] with occupancy [...] s: columns `bits/spike`, `bits/sec`."""
     known = np.where(np.isfinite(rates[0]), seconds, 0.0)
     names = [f"axis{k}" for k in range(seconds.ndim)]

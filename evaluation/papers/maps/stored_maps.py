@@ -19,7 +19,8 @@ from evaluation.papers.trial_sessions import start_session
 from evaluation.studies.machine import code_digest
 from ratslam.core.session import Session
 from ratslam.mapping.map import KeyframeMap
-from ratslam.runs.saved_map import NAME, describe_readings, write_map
+from ratslam.methods.map_file import NAME
+from ratslam.runs.saved_map import describe_readings, write_map
 from robot.touch_source import observation_of
 from tactile.base.files import hidden_folder
 
@@ -66,7 +67,7 @@ class MapArrays(NamedTuple):
         """Those of the map of a finished session over steps with these true poses [T, 3]."""
         made = session.map
         assert isinstance(made, KeyframeMap)
-        return cls(made.map_trajectory(), truth, made.pieces(), made.kept_keyframes().count)
+        return cls(made.map_trajectory(), truth, made.pieces(), made.state.count)
 
 
 class StoredMap(NamedTuple):

@@ -81,21 +81,18 @@ def _judge_session(task: TouchTask) -> JudgedSession:
     session = start_session(config, log)
     truth, map = run_session(config, log, session).truth, session.map
     assert isinstance(map, KeyframeMap)
-    final, graph, steps = map.solution(), map.keyframes(), map.keyframe_steps()
+    final, steps = map.solution(), map.keyframe_steps()
     scores = final.log.scores()
     # Sequences count from this evidence of recall and this number of candidates on.
     chosen = np.flatnonzero((scores >= 5.0) & (final.log.left() >= 2))
     later = steps >= (int(CHANGE * len(truth)) if task.row == "control: other maze" else 0)
-    known = (
-        sequence_evidence(graph, final.fit, final.log, final.cut, chosen, after)
-        for after in (BEYOND, YOUNG, 0)
-    )
+    known = (sequence_evidence(final, chosen, after) for after in (BEYOND, YOUNG, 0))
     # At least half of the candidates of a true sequence agree with the truth, to 3.6 cells and 30 degrees.
     table, poses = final.log.table(), truth[steps]
     frame, match = table[:, 0].astype(int), table[:, 1].astype(int)
     error = between(poses[match], poses[frame])
-    turned = np.abs(wrap(error[:, 2] + table[:, 2] * graph.sector_angle))
-    right = (np.hypot(error[:, 0], error[:, 1]) < 3.6 * graph.cell) & (turned < np.radians(30))
+    turned = np.abs(wrap(error[:, 2] + table[:, 2] * final.sector_angle))
+    right = (np.hypot(error[:, 0], error[:, 1]) < 3.6 * final.cell) & (turned < np.radians(30))
     right &= later[frame] == later[match]  # the later keyframes may be of another world
     true = np.array([right[table[:, 5] == sequence].mean() >= 0.5 for sequence in chosen.tolist()], bool)
     return true, scores[chosen], final.log.verdicts()[chosen] == Verdict.ACCEPTED, tuple(known)

@@ -23,7 +23,7 @@ import numpy as np
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
 from ratslam.core.compilation import Precision, prepare_precision
 from ratslam.core.session import Session
-from ratslam.mapping import archive, selection_worker
+from ratslam.mapping import keyframe_merger, selection_worker
 from ratslam.runs.build_session import build_session, open_observations
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from robot.sources.in_memory import load_into_memory
@@ -48,20 +48,19 @@ PARTS = {
     ),
     "packing": ("core/packing.py", "core/session.py"),
     "feedback to the belief": ("methods/", "recall/", "network/", "classic/", "core/backend.py"),
-    "views of the map": ("mapping/appearance.py", "mapping/view_sectors.py", "mapping/signed"),
+    "views of the map": ("mapping/appearance.py",),
     "closures": (
-        "mapping/verification.py", "mapping/acceptance.py", "mapping/closure_odds.py",
-        "mapping/odometry_scan.py", "mapping/loop_closures.py", "mapping/piece_",
+        "mapping/verification.py", "mapping/acceptance.py", "mapping/odometry_scan.py",
+        "mapping/loop_closures.py", "mapping/pieces.py", "mapping/live_filter.py",
     ),
     "judge": ("mapping/closure_judge.py",),
     "selection": (
         "mapping/selection_worker.py", "mapping/closure_selection.py", "mapping/map_solution.py",
-        "mapping/map_hypotheses.py", "mapping/odometry_calibration.py", "mapping/delayed_job.py",
+        "mapping/odometry_calibration.py",
     ),
-    "merging": ("mapping/archive", "mapping/keyframe_merger.py", "mapping/merg"),
-    "solver": ("mapping/optimizer.py", "mapping/linea", "mapping/block_", "mapping/least_", "mapping/edges"),
-    "health": ("mapping/map_health.py", "mapping/claimed_revisits.py"),
-    "log and experiences": ("mapping/step_record.py", "mapping/experiences.py", "mapping/travel.py"),
+    "merging": ("mapping/keyframe_merger.py", "mapping/merg"),
+    "solver": ("mapping/optimizer.py", "mapping/normal_equations.py"),
+    "log and experiences": ("mapping/step_record.py", "mapping/experiences.py"),
     "rest of the map": ("",),
 }  # fmt: skip
 """Parts of a cycle, and how the places of their functions, `FILE.py:FUNCTION`, begin; the first that fits
@@ -125,7 +124,10 @@ def profile_table(sessions: Sequence[str] | None = None) -> Iterator[str]:
     cycles = _open_cycles(sessions, ("float64",))
     columns = []
     for cycle in cycles:
-        with patch.object(selection_worker, "THREAD", _Inline()), patch.object(archive, "THREAD", _Inline()):
+        with (
+            patch.object(selection_worker, "THREAD", _Inline()),
+            patch.object(keyframe_merger, "THREAD", _Inline()),
+        ):
             total = min(cycle.time() for _ in range(3))
             parts = _profile(cycle)
         columns.append({part: us * total / sum(parts.values()) for part, us in parts.items()})

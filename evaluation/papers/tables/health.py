@@ -95,20 +95,20 @@ def _judge_session(task: tuple[str, int]) -> np.ndarray:
     _, session, run = run_recording(config, miscalibrate if copied else None, number)
     map = session.map
     assert isinstance(map, KeyframeMap)
-    truth, graph = run.truth[map.keyframe_steps()], map.keyframes()
+    truth = run.truth[map.keyframe_steps()]
     known = np.isfinite(truth).all(axis=1)
 
     def error(poses: np.ndarray) -> float:
         return energy_all_pairs(poses[known], truth[known]).total if touch else known_ate(poses, truth)
 
-    before = error(graph.dead_reckoned())
+    before = error(map.solution().dead_reckoned())
     limit = HARM_FACTOR * before + (0.0 if touch else HARM_MARGIN)
     rows = []
     for _, solution in spoilt_maps(map, truth, number):
         closures = int((solution.log.weights() > ACCEPTED_WEIGHT).sum())
         if closures:
-            after = error(solution.fit.poses)
-            rows.append((*health_features(graph, solution), after / before, after > limit, closures))
+            after = error(solution.pose.rows)
+            rows.append((*health_features(solution), after / before, after > limit, closures))
     return np.array(rows, float).reshape(len(rows), len(WEIGHTS) + 3)
 
 

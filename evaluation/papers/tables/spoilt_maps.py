@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ratslam.mapping.keyframe_graph import NO_ROBUST_SCALE, KeyframeGraph
-from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
+from ratslam.mapping.loop_closures import Candidate, Verdict
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.map_solution import MapSolution
+from ratslam.mapping.map_state import NO_ROBUST_SCALE, MapState
 from ratslam.mapping.optimizer import MapFit, System
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, wrap
@@ -39,24 +38,23 @@ _RECIPES: tuple[tuple[str, dict[str, Any], bool], ...] = (
 """Names, arguments of `spoil`, and whether sequences that disagree lose weight."""
 
 
-def spoilt_maps(map: KeyframeMap, truth: np.ndarray, seed: int) -> Iterator[tuple[str, MapSolution]]:
+def spoilt_maps(map: KeyframeMap, truth: np.ndarray, seed: int) -> Iterator[tuple[str, MapState]]:
     """The final map and a map of each recipe that has closures, by name.
 
     Args:
         truth: [N, 3] true poses of the keyframes, NaN where unknown.
     """
-    graph, final = map.keyframes(), map.solution()
+    final = map.solution()
     random = stream(seed, "spoilt_maps")
     yield "final", final
     for name, changes, robust in _RECIPES:
-        log = spoil(graph, final.log, truth, random, **changes)
-        if len(log.accepted_rows()):
-            yield name, solved_anew(graph, log, final, robust)
+        spoilt = spoil(final, truth, random, **changes)
+        if len(spoilt.log.accepted_rows()):
+            yield name, solved_anew(spoilt, robust)
 
 
 def spoil(
-    graph: KeyframeGraph,
-    log: ClosureLog,
+    final: MapState,
     truth: np.ndarray,
     random: np.random.Generator,
     *,
@@ -64,15 +62,17 @@ def spoil(
     more: int = 0,
     least: float = np.inf,
     choices: int = 0,
-) -> ClosureLog:
-    """A copy of a log with other verdicts and, where the session has room for them, false sequences.
+) -> MapState:
+    """A final map with other verdicts and, where the session has room for them, false sequences, its poses as
+    they were.
 
     Args:
         truth: see `spoilt_maps`. kept: share of the accepted sequences that stay. more: number of refused
             ones accepted. least: evidence from which on refused ones are accepted. choices: pairs of
             stretches of which the one that looks most alike becomes a false sequence; 0: there are none.
     """
-    log = log.copy()
+    spoilt = final.trial()
+    log = spoilt.log
     verdicts, long = log.verdicts().copy(), log.sizes() >= 2
     refused = np.flatnonzero(long & (verdicts != Verdict.ACCEPTED))
     for sequence in np.flatnonzero(verdicts == Verdict.ACCEPTED).tolist():
@@ -86,66 +86,67 @@ def spoil(
     if choices:
         # 1 to 4 false sequences of 6 to 39 candidates.
         count, length = (int(random.integers(low, high + 1)) for low, high in ((1, 4), (6, 39)))
-        if graph.count - length > graph.guard + length + 5:
+        if final.count - length > final.guard + length + 5:
             for _ in range(count):
-                _add_false_sequence(graph, log, truth, length, random, choices)
-    return log
+                _add_false_sequence(spoilt, truth, length, random, choices)
+    return spoilt
 
 
 def _add_false_sequence(
-    graph: KeyframeGraph, log: ClosureLog, truth: np.ndarray, length: int, random: np.random.Generator,
+    state: MapState, truth: np.ndarray, length: int, random: np.random.Generator,
     choices: int,
 ) -> None:  # fmt: skip
     """Accepts the false sequence that looks most alike of at most `choices` pairs of stretches; none if
     there is none among `_ATTEMPTS` random pairs."""
     found: list[tuple[float, int, int]] = []
-    first, reckoned = graph.guard + length + 5, graph.dead_reckoned()
+    first, reckoned = state.guard + length + 5, state.dead_reckoned()
     for _ in range(_ATTEMPTS):
-        frame = int(random.integers(first, graph.count - length))
-        match = int(random.integers(0, frame - graph.guard - length))
-        if len(found) < choices and _is_false(graph, reckoned, truth, frame, match, length):
+        frame = int(random.integers(first, state.count - length))
+        match = int(random.integers(0, frame - state.guard - length))
+        if len(found) < choices and _is_false(state, reckoned, truth, frame, match, length):
             # Mean misfit of the candidates, about every sixth.
             steps = range(0, length, max(1, length // 6))
-            misfits = [graph.least_misfit(frame + k, np.array([match + k]), np.array([False])) for k in steps]
+            misfits = [state.least_misfit(frame + k, np.array([match + k]), np.array([False])) for k in steps]
             found.append((float(np.mean(misfits)), frame, match))
     if not found:
         return
     _, frame, match = min(found)
     evidence = float(random.uniform(1.0, 4.0))
     for k in range(length):
-        sequence = log.add(Candidate(frame + k, match + k, 0, 0.9, evidence), k > 0)
-    log.judge(sequence, Verdict.ACCEPTED)
+        sequence = state.log.add(Candidate(frame + k, match + k, 0, 0.9, evidence), k > 0)
+    state.log.judge(sequence, Verdict.ACCEPTED)
 
 
-def solved_anew(graph: KeyframeGraph, log: ClosureLog, final: MapSolution, robust: bool) -> MapSolution:
-    """The map of a log: the cheaper one of those reached from the final map and from odometry.
+def solved_anew(state: MapState, robust: bool) -> MapState:
+    """The map solved for: the cheaper one of those reached from its poses and from odometry.
 
     Args:
         robust: whether sequences that disagree lose weight.
     """
-    problem = graph.problem(log, final.cut)
+    problem = state.problem()
     if not robust:
         scale = np.full_like(problem.closures.scale, NO_ROBUST_SCALE)
         problem = problem._replace(closures=problem.closures._replace(scale=scale, cost_limit=np.inf))
-    starts = [final.fit, MapFit(graph.dead_reckoned(), 0.0, np.zeros(0))]
+    starts = [state.fit(), MapFit(state.dead_reckoned(), 0.0, np.zeros(0))]
     system = System(problem)
     # 40 iterations at most, to changes of 1 mm and 1 mrad.
     fit = min((system.solve(start, 40, 1e-3) for start in starts), key=system.robust_cost)
-    log.weigh(fit.weights)
-    return MapSolution(fit, log, final.cut)
+    state.log.weigh(fit.weights)
+    state.take_fit(fit)
+    return state
 
 
 def _is_false(
-    graph: KeyframeGraph, reckoned: np.ndarray, truth: np.ndarray, frame: int, match: int, length: int
+    state: MapState, reckoned: np.ndarray, truth: np.ndarray, frame: int, match: int, length: int
 ) -> bool:
     """Whether two stretches are of other places, and odometry moved alike on both."""
     apart = truth[frame] - truth[match]
     # A place is another one beyond 5 cells or 0.7 rad; odometry is alike within 2 cells and 0.5 rad.
-    if not np.hypot(*apart[:2]) > 5.0 * graph.cell and not abs(wrap(apart[2])) > 0.7:
+    if not np.hypot(*apart[:2]) > 5.0 * state.cell and not abs(wrap(apart[2])) > 0.7:
         return False
     for k in (length // 2, length):
         moved = [between(reckoned[at], reckoned[at + k]) for at in (frame, match)]
         error = moved[0] - moved[1]
-        if np.hypot(*error[:2]) > 2.0 * graph.cell or abs(wrap(error[2])) > 0.5:
+        if np.hypot(*error[:2]) > 2.0 * state.cell or abs(wrap(error[2])) > 0.5:
             return False
     return True

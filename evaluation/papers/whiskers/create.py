@@ -23,10 +23,10 @@ from evaluation.papers.whiskers.bumps import wall_distances
 from evaluation.plots.style import BLUE, GREY, INK, VERMILLION, add_axes, name_axes, new_figure
 from evaluation.studies.metrics import SessionResult
 from ratslam.core.backend import Map
-from ratslam.mapping.keyframe_graph import KeyframeGraph
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_solution import DOUBTED, cheapest_map
+from ratslam.mapping.map_state import MapState
 from tactile.base.se2 import between, compose, integrate, wrap
 
 FILES = tuple(f"data/create_lab_{name}.csv" for name in ("truth", "bumps", "walls", "depth"))
@@ -92,27 +92,29 @@ def _measure_variant(slam_map: Map, run: SessionResult) -> Variant:
 def _revisits_ate(slam_map: KeyframeMap, truth: np.ndarray) -> float:
     """ATE of the keyframes with the true revisits as closures in the same graph, m: what recall could give
     if it recognised every revisit, with the sectors' resolution, and nothing else."""
-    graph, steps = slam_map.keyframes().copy(), slam_map.keyframe_steps()
-    truth, log = truth[steps], ClosureLog()
-    for candidate in true_revisits(graph, truth):
-        last = log.last()
-        log.add(candidate, last is not None and candidate.keyframe - last.keyframe <= graph.config.max_gap)
-    for sequence in range(log.sequences):
-        log.judge(sequence, Verdict.ACCEPTED)
-    graph.dead_reckon()
-    return known_ate(cheapest_map(graph, log, [graph.start]).fit.poses, truth)
+    state, steps = slam_map.state.unmerged.copy(), slam_map.keyframe_steps()
+    truth, state.log = truth[steps], ClosureLog()
+    for candidate in true_revisits(state, truth):
+        last = state.log.last()
+        state.log.add(
+            candidate, last is not None and candidate.keyframe - last.keyframe <= state.config.max_gap
+        )
+    for sequence in range(state.log.sequences):
+        state.log.judge(sequence, Verdict.ACCEPTED)
+    state.dead_reckon()
+    return known_ate(cheapest_map(state, [state.start]).pose.rows, truth)
 
 
-def true_revisits(graph: KeyframeGraph, truth: np.ndarray) -> Iterator[Candidate]:
+def true_revisits(state: MapState, truth: np.ndarray) -> Iterator[Candidate]:
     """Of each keyframe, the nearest older one at the same true place; `truth` is [N, 3]."""
-    for k in range(graph.guard, len(truth)):
-        old = truth[: k - graph.guard]
+    for k in range(state.guard, len(truth)):
+        old = truth[: k - state.guard]
         apart = np.hypot(*(old - truth[k])[:, :2].T)
         turn = wrap(truth[k, 2] - old[:, 2])
         same = (apart < TRUE_DISTANCE) & (np.abs(turn) < TRUE_TURN)
         if same.any():
             match = int(np.argmin(np.where(same, apart, np.inf)))
-            shift = round(-float(turn[match]) / graph.sector_angle)
+            shift = round(-float(turn[match]) / state.sector_angle)
             yield Candidate(k, match, shift, 1.0, REVISIT_SCORE)
 
 

@@ -150,7 +150,7 @@ def walk_randomly(
 
     count = int(np.ceil(seconds * rate_hz)) + 1
     draws = stream(seed, "rat walk").standard_normal((count, 2))
-    z = ornstein_uhlenbeck(draws, np.array([config.speed_time, config.turn_time]), 1 / rate_hz)
+    z = _ornstein_uhlenbeck(draws, np.array([config.speed_time, config.turn_time]), 1 / rate_hz)
     spread = config.speed_sd**2 / config.speed
     speed = gamma.ppf(norm.cdf(z[:, 0]), config.speed / spread, scale=spread)
     turn = config.turn_sd * z[:, 1]
@@ -158,7 +158,7 @@ def walk_randomly(
     return RatPath(np.arange(count) / rate_hz, position)
 
 
-def ornstein_uhlenbeck(draws: np.ndarray, time: np.ndarray, step: float) -> np.ndarray:
+def _ornstein_uhlenbeck(draws: np.ndarray, time: np.ndarray, step: float) -> np.ndarray:
     """[N, D] stationary processes of variance 1 from normal draws [N, D], for correlation times [D], s."""
     keep = np.exp(-step / time)
     fresh = np.sqrt(1 - keep**2)
