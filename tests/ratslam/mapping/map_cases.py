@@ -8,8 +8,10 @@ import numpy as np
 
 from ratslam.mapping.acceptance import AcceptByOdds
 from ratslam.mapping.appearance import LabelAppearance
-from ratslam.mapping.config import KeyframeMapConfig
+from ratslam.mapping.config import FULL, KeyframeMapConfig
 from ratslam.mapping.map import KeyframeMap
+from ratslam.mapping.map_state import MapState
+from tactile.base.se2 import compose
 from tactile.base.types import Odometry, observation
 
 CELL = 0.5
@@ -40,6 +42,26 @@ class Pose(NamedTuple):
     action: int
 
 
+def new_graph(cell, guard, appearance=None, ablation=FULL, **settings):
+    """A graph without keyframes; of ids by default."""
+    config = KeyframeMapConfig.model_validate(settings)
+    return MapState(config, cell, appearance or LabelAppearance(), guard, ablation)
+
+
+def add(graph, motion, pose=None, length=None, turn=None):
+    """One more keyframe, by odometry [3] from the newest; at this pose [3], if there is one."""
+    length = float(np.hypot(*motion[:2])) if length is None else length
+    pose = compose(graph.pose.rows[-1], motion) if pose is None else pose
+    graph.append(pose, motion, length, abs(float(motion[2])) if turn is None else turn)
+
+
+def same(one, other):
+    """Whether two maps have the same state, bit for bit."""
+    first, second = one.arrays(), other.arrays()
+    assert first.keys() == second.keys()
+    return all(np.array_equal(first[name], second[name], equal_nan=True) for name in first)
+
+
 def new_map(acceptance=AcceptByOdds, find_tie=None, **settings):
     config = KeyframeMapConfig.model_validate(settings)
     return KeyframeMap(config, CELL, LabelAppearance(), acceptance, find_tie=find_tie)
@@ -63,3 +85,18 @@ def sequence(start, match, length, ratio):
 
 TRUE = sequence(LAP + 2, 2, 12, 4.0)
 """The beginning of the lap, seen where it is."""
+
+
+def with_log(state, log, cut=None):
+    """The same map with these closures and, if given, cuts."""
+    state.log = log
+    state.cut = state.cut if cut is None else cut
+    return state
+
+
+def at_fit(state, fit, log, cut):
+    """The map at a fit, with these closures and cuts."""
+    found = with_log(state, log).trial()
+    found.take_fit(fit)
+    found.cut, found.log = cut, log
+    return found

@@ -66,7 +66,7 @@ class Drive:
     @property
     def steps(self):
         """Number of keyframes driven; each step is one."""
-        return self.map.keyframes().count
+        return self.map.state.unmerged.count
 
     def go(self, last):
         """Drives up to keyframe `last` - 1; at every `CHUNK`th one the map may merge."""
@@ -96,7 +96,7 @@ class Drive:
 
     def merged_apart(self):
         """[T] true distances of keyframes from those that they are or are merged with, m."""
-        onto = self.rows[self.map.archive.row.rows]
+        onto = self.rows[self.map.state.archive.row.rows]
         return self._apart(onto)
 
     def experience_apart(self):

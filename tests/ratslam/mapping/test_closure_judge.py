@@ -1,4 +1,4 @@
-"""The judge of closures: true sequences have higher log-odds than false ones, and what they are worth."""
+"""Whether closures and maps are believed, on laps with true and false closures, whatever the sensor."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ratslam.core.arrays import GrowableArray
+from ratslam.mapping import map_solution as revisits
 from ratslam.mapping.acceptance import AcceptByEvidence
-from ratslam.mapping.appearance import LabelAppearance
+from ratslam.mapping.appearance import Appearance, LabelAppearance, ViewAppearance
 from ratslam.mapping.closure_judge import (
     AT_ONCE,
     BEYOND,
@@ -19,10 +20,62 @@ from ratslam.mapping.closure_judge import (
     shipped_weights,
 )
 from ratslam.mapping.config import KeyframeMapConfig
-from ratslam.mapping.loop_closures import UNLIKELY, Candidate, Verdict
-from ratslam.mapping.map_solution import DOUBTED
-from tests.ratslam.mapping.lap_cases import APPEARANCES, CLEAN, FALSE, LAP, LAPS, closed, drive, solution
+from ratslam.mapping.loop_closures import UNLIKELY, Candidate, ClosureLog, Verdict
+from ratslam.mapping.map_solution import (
+    DOUBTED,
+    claimed_revisits,
+    claims_cost,
+    health_features,
+    worse_than_odometry,
+)
+from ratslam.mapping.map_state import NO_ROBUST_SCALE, MapState
+from ratslam.mapping.optimizer import solve
+from tactile.base.se2 import between, compose
+from tactile.base.types import Odometry, observation
+from tests.helpers.laps import square
+from tests.ratslam.mapping.map_cases import add, at_fit, new_graph, with_log
 
+CELL, GUARD, LAP, SIZE = 0.05, 20, 48, 12
+LAPS = 5
+TRUTH = square("A" * LAPS)
+DRIFT = 0.004  # heading error of the odometry, rad a step
+APPEARANCES = {"ids": LabelAppearance, "views": lambda: ViewAppearance(SIZE, None)}
+
+
+def drive_laps(appearance: Appearance, places: int = LAP) -> MapState:
+    """Keyframes on laps around a square of so many places that look different, by odometry that turns."""
+    graph = new_graph(CELL, GUARD, appearance)
+    looks = np.random.default_rng(0).random((LAP, SIZE))
+    pose = TRUTH[0]
+    for k in range(len(TRUTH)):
+        motion = np.zeros(3) if k == 0 else between(TRUTH[k - 1], TRUTH[k]) + [0, 0, DRIFT]
+        pose = compose(pose, motion)
+        add(graph, motion, pose)
+        reading = observation(Odometry(*motion, 0.1), looks[k % places, None, :, None], label=k % places)
+        appearance.append(reading, motion[2], float(np.hypot(*motion[:2])))
+    return graph
+
+
+def closed(sequences: list[tuple[int, int, int]]) -> ClosureLog:
+    """A log of accepted sequences: first keyframe, first match, number of closures."""
+    log = ClosureLog()
+    for frame, match, count in sequences:
+        log.add_accepted(Candidate(frame + k, match + k, 0, 0.9, 3.0) for k in range(count))
+    return log
+
+
+def solution(graph: MapState, log: ClosureLog) -> MapState:
+    """The map with these closures, none of which loses weight."""
+    problem = with_log(graph, log, graph.cut).problem()
+    scale = np.full_like(problem.closures.scale, NO_ROBUST_SCALE)
+    problem = problem._replace(closures=problem.closures._replace(scale=scale))
+    return at_fit(graph, solve(graph.fit(), problem, 60), log, graph.cut)
+
+
+CLEAN = [(LAP * lap + 5, LAP * (lap - 1) + 5, 20) for lap in range(1, LAPS)]
+FALSE = [(LAP * 2, 12, 30), (LAP * 3 + 5, 30, 30)]
+TURNED_LAPS = np.stack([TRUTH[(k + 7 * (k // LAP)) % LAP] for k in range(len(TRUTH))])
+"""Poses by which every lap begins seven places ahead of the one before."""
 FIRST = np.array([0])
 
 
@@ -34,15 +87,15 @@ class JudgedLabels(LabelAppearance):
 
 @pytest.fixture(params=APPEARANCES)
 def graph(request):
-    return drive(APPEARANCES[request.param]())
+    return drive_laps(APPEARANCES[request.param]())
 
 
 @pytest.fixture
 def judged():
     """Laps that are judged, and their clean map."""
-    graph = drive(JudgedLabels())
+    graph = drive_laps(JudgedLabels())
     found = solution(graph, closed(CLEAN))
-    graph.pose.rows[:] = found.fit.poses
+    graph.pose.rows[:] = found.pose.rows
     return graph, found.log
 
 
@@ -55,8 +108,8 @@ def cuts(graph, *frames):
 
 
 def evidence(graph, log, sequences, cut=None, after=BEYOND):
-    fit = solution(graph, log).fit
-    return sequence_evidence(graph, fit, log, cuts(graph) if cut is None else cut, sequences, after)
+    fit = solution(graph, log).fit()
+    return sequence_evidence(at_fit(graph, fit, log, cuts(graph) if cut is None else cut), sequences, after)
 
 
 def test_a_true_sequence_has_higher_log_odds_than_a_false_one_of_the_same_map(graph):
@@ -87,7 +140,7 @@ def test_judging_changes_nothing_and_gives_the_same_bits_again(judged):
     graph, log = judged
     before = {**graph.arrays(), **log.arrays()}
     first, again = (
-        judge_sequences(graph, graph.fit(), log, graph.cut, np.arange(len(CLEAN))) for _ in range(2)
+        judge_sequences(at_fit(graph, graph.fit(), log, graph.cut), np.arange(len(CLEAN))) for _ in range(2)
     )
     assert first.tobytes() == again.tobytes()
     after = {**graph.arrays(), **log.arrays()}
@@ -96,19 +149,18 @@ def test_judging_changes_nothing_and_gives_the_same_bits_again(judged):
 
 def test_of_views_without_weights_and_of_a_robot_that_may_be_carried_nothing_is_said(judged):
     graph, log = judged
-    assert np.isfinite(judge_sequences(graph, graph.fit(), log, graph.cut, FIRST)).all()
+    assert np.isfinite(judge_sequences(at_fit(graph, graph.fit(), log, graph.cut), FIRST)).all()
     graph.config = graph.config.model_copy(update={"may_be_carried": True})
-    assert np.isnan(judge_sequences(graph, graph.fit(), log, graph.cut, FIRST)).all()
-    graph = drive(LabelAppearance())
-    assert np.isnan(judge_sequences(graph, graph.fit(), closed(CLEAN), graph.cut, FIRST)).all()
+    assert np.isnan(judge_sequences(at_fit(graph, graph.fit(), log, graph.cut), FIRST)).all()
+    graph = drive_laps(LabelAppearance())
+    assert np.isnan(judge_sequences(at_fit(graph, graph.fit(), closed(CLEAN), graph.cut), FIRST)).all()
 
 
-def test_a_map_of_false_closures_is_doubted_and_one_of_true_ones_is_not(judged):
+def test_closures_of_a_false_map_are_doubted_and_those_of_a_true_one_are_not(judged):
     graph, _ = judged
     clean, false = (solution(graph, closed(sequences)) for sequences in (CLEAN, FALSE))
-    assert doubt_of_closures(graph, *clean) < 0.1
-    assert doubt_of_closures(graph, *false) > DOUBTED
-    assert np.isnan(doubt_of_closures(graph, *solution(graph, closed([]))))
+    assert doubt_of_closures(clean) < 0.1 < DOUBTED < doubt_of_closures(false)
+    assert np.isnan(doubt_of_closures(solution(graph, closed([]))))
 
 
 def test_an_unlikely_sequence_counts_less_as_its_odds_fall(judged):
@@ -123,7 +175,7 @@ def test_a_sequence_that_has_lost_keyframes_keeps_its_log_odds(judged):
     gone = np.zeros(graph.count, bool)
     gone[log.members(1)[0, 0]] = True
     log.merge(gone, np.arange(graph.count), np.zeros(graph.count, bool))
-    judge_anew(graph, log, np.arange(len(CLEAN)))
+    judge_anew(with_log(graph, log), np.arange(len(CLEAN)))
     assert list(log.log_odds() == -7.0) == [False, True, False, False]
 
 
@@ -138,7 +190,8 @@ def test_an_unlikely_sequence_waits_for_a_selection(monkeypatch, judged, select_
     log = closed(CLEAN[:1])
     log.judge(0, Verdict.OPEN)
     frame, match, shift, _ = log.members(0)[-1].tolist()
-    assert AcceptByEvidence().judge(graph, log, 0, Candidate(frame, match, shift, 0.9, 3.0)) is accepted
+    candidate = Candidate(frame, match, shift, 0.9, 3.0)
+    assert AcceptByEvidence().judge(with_log(graph, log), 0, candidate) is accepted
     assert (odds >= AT_ONCE) == accepted or not select_every
 
 
@@ -150,3 +203,46 @@ def test_shipped_weights_are_those_of_the_features(judged):
     within, around = weights[:, 3 : 3 + KINDS], weights[:, 3 + KINDS :]
     assert np.all(within[:, :2] <= 0)
     assert np.all(around[:, :2] <= 0)  # nor are contradictions evidence for it
+
+
+def test_a_map_with_false_loops_is_doubted_and_one_of_true_closures_is_not(graph):
+    clean, false = (solution(graph, closed(rows)) for rows in (CLEAN, FALSE))
+    assert worse_than_odometry(clean) < 0.2 < DOUBTED < worse_than_odometry(false)
+    true, wrong = (health_features(found) for found in (clean, false))
+    assert true[0] > wrong[0]
+    assert true[2] < wrong[2]
+    moved = clean.trial()
+    moved.pose.rows[:] = compose(np.array([3.0, -2.0, 0.0]), clean.pose.rows)
+    assert health_features(moved) == pytest.approx(true, abs=1e-6)
+    clean.log.weigh(np.full(len(CLEAN), 0.1))
+    assert np.isfinite(worse_than_odometry(clean))  # closures of little weight are closures
+    for sequence in range(false.log.sequences):
+        false.log.judge(sequence, Verdict.OPEN)
+    assert np.isnan(worse_than_odometry(with_log(graph, false.log).solved()))  # and none are none
+
+
+def test_true_poses_claim_revisits_that_the_views_confirm(graph):
+    frame, match, rank, examined = claimed_revisits(graph, TRUTH, 300)
+    assert examined == len(TRUTH) - GUARD - 1
+    assert len(frame) > 2 * LAP
+    assert rank.mean() > 0.8
+    assert np.all(frame - match > GUARD)
+    assert np.count_nonzero(frame == 4 * LAP + 10) == 4  # each pass is a claim of its own
+    alike = drive_laps(LabelAppearance(), places=1)  # views without information bear nothing out
+    assert np.all(claimed_revisits(alike, TRUTH, 300)[2] == 0.5)
+
+
+def test_right_poses_cost_less_than_wrong_ones_and_those_that_claim_nothing_nothing(graph, monkeypatch):
+    right, wrong = claims_cost(graph, TRUTH), claims_cost(graph, TURNED_LAPS)
+    false = claims_cost(graph, solution(graph, closed(FALSE)).pose.rows)
+    assert right < 0 < wrong
+    assert right < false
+    assert claims_cost(graph, solution(graph, closed(CLEAN)).pose.rows) < false
+    for poses, cost in ((TRUTH, right), (TURNED_LAPS, wrong)):  # wherever the map lies
+        assert claims_cost(graph, compose(np.array([-1.0, 5.0, -3.0]), poses)) == pytest.approx(
+            cost, rel=1e-9
+        )
+    apart = TRUTH + np.arange(len(TRUTH))[:, None] * [1.0, 0.0, 0.0]
+    assert claims_cost(graph, apart) == claims_cost(graph, TRUTH[: GUARD + 1]) == 0.0
+    monkeypatch.setattr(revisits, "JUDGED", 60)  # however many keyframes are examined
+    assert claims_cost(graph, TRUTH) == pytest.approx(right, rel=0.1)

@@ -25,13 +25,6 @@ def at(x, y=0.0, heading=0.0, matched=-1, sure=False):
     return (x, y, heading, matched, sure)
 
 
-def test_the_first_frame_makes_an_experience():
-    world = Experiences(RADIUS, HEADING)
-    assert world.current == -1
-    assert world.arrive(np.zeros((1, 3)), 0, -1, False) == (0, -1, Action.CREATE)
-    assert world.current == 0
-
-
 @pytest.mark.parametrize(
     ("to", "stays"),
     [
@@ -46,49 +39,42 @@ def test_the_first_frame_makes_an_experience():
 @pytest.mark.parametrize("facing", [0.0, 3.0, -3.1])  # also across the wrap of angles
 def test_an_experience_reaches_as_far_as_its_radius(to, stays, facing):
     there = (*to[:2], wrap(to[2] + facing), *to[3:])
-    _, changes, _ = walk(at(0, 0, facing), there)
+    assert Experiences(RADIUS, HEADING).current == -1
+    world, changes, _ = walk(at(0, 0, facing), there)
+    assert changes[0] == (0, -1, Action.CREATE)
+    assert world.current == changes[1][0]
     assert changes[1] == ((0, 0, Action.NONE) if stays else (1, 0, Action.CREATE))
 
 
-def test_the_radius_is_around_the_first_frame():
-    _, changes, _ = walk(at(0), at(0.7), at(1.4))
-    assert [s[0] for s in changes] == [0, 0, 1]
+NONE, CREATE, LINK, SET = Action.NONE, Action.CREATE, Action.LINK, Action.SET
+THREE = [at(0), at(5), at(10)]
 
 
-def test_a_matched_frame_reaches_its_experience_at_any_distance():
-    _, changes, _ = walk(at(0), at(5), at(10), at(15.2, matched=1), at(20), at(15, matched=1))
-    assert changes[3] == (1, 2, Action.SET)  # by the link from 1 to 2, backwards
-    assert changes[5] == (1, 3, Action.SET)
-
-
-def test_a_new_connection_is_a_link_and_later_a_set():
-    frames = [at(0), at(5), at(10), at(0, matched=0), at(10, matched=2), at(0, matched=0), at(0.1, matched=0)]
+@pytest.mark.parametrize(
+    ("frames", "expected"),
+    [
+        # A matched frame reaches its experience at any distance: by the link from 1 to 2, backwards.
+        ([*THREE, at(15.2, matched=1)], [(1, 2, SET)]),
+        ([*THREE, at(15.2, matched=1), at(20), at(15, matched=1)], [(3, 1, CREATE), (1, 3, SET)]),
+        ([at(0), at(0.5), at(5), at(10), at(0, matched=1)], [(1, 0, CREATE), (2, 1, CREATE), (0, 2, LINK)]),
+        # The radius is around the first frame.
+        ([at(0), at(0.7), at(1.4)], [(0, -1, CREATE), (0, 0, NONE), (1, 0, CREATE)]),
+        # A new connection is a link, and later a set.
+        ([*THREE, at(0, matched=0), at(10, matched=2)], [(0, 2, LINK), (2, 0, SET)]),
+        ([*THREE, at(0, matched=0), at(10, matched=2), at(0, matched=0)], [(2, 0, SET), (0, 2, SET)]),
+        ([*THREE, at(0, matched=0), at(0.1, matched=0)], [(0, 2, LINK), (0, 0, NONE)]),
+        # Only a reliable pose finds known experiences.
+        ([*THREE, at(0.9, sure=True)], [(0, 2, LINK)]),
+        ([*THREE, at(0.9)], [(3, 2, CREATE)]),
+        ([*THREE, at(1.1, sure=True)], [(3, 2, CREATE)]),
+        # The nearest experience, unless the current one is in reach.
+        ([at(0), at(1.5), at(8), at(0.9, sure=True)], [(1, 2, SET)]),
+        ([at(0), at(1.5), at(0.7, sure=True), at(0.8, sure=True)], [(1, 1, NONE), (1, 1, NONE)]),
+    ],
+)  # fmt: skip
+def test_frames_reach_known_experiences(frames, expected):
     _, changes, _ = walk(*frames)
-    assert [s[2] for s in changes[3:]] == [Action.LINK, Action.SET, Action.SET, Action.NONE]
-    assert [s[0] for s in changes[3:]] == [0, 2, 0, 0]
-
-
-def test_a_match_reaches_the_experience_of_the_matched_frame():
-    _, changes, _ = walk(at(0), at(0.5), at(5), at(10), at(0, matched=1))
-    assert changes[4] == (0, 2, Action.LINK)
-
-
-def test_only_a_reliable_pose_finds_known_experiences():
-    frames = [at(0), at(5), at(10), at(0.9, sure=True)]
-    _, changes, _ = walk(*frames)
-    assert changes[3] == (0, 2, Action.LINK)
-    _, changes, _ = walk(*frames[:3], at(0.9))
-    assert changes[3] == (3, 2, Action.CREATE)
-    _, changes, _ = walk(*frames[:3], at(1.1, sure=True))
-    assert changes[3] == (3, 2, Action.CREATE)
-
-
-def test_the_nearest_experience_is_found_unless_the_current_one_is_in_reach():
-    _, changes, _ = walk(at(0), at(1.5), at(8), at(0.9, sure=True))
-    assert changes[3][0] == 1
-    _, changes, _ = walk(at(0), at(1.5), at(0.7, sure=True), at(0.8, sure=True))
-    assert [s[0] for s in changes[2:]] == [1, 1]  # 0 is nearer, 1 is the current one
-    assert changes[2][2] == Action.NONE
+    assert changes[-len(expected) :] == expected
 
 
 frames = st.lists(

@@ -1,4 +1,4 @@
-"""Laws of the closure log: candidates, accepted closures and restored state."""
+"""Laws of the closure log: candidates, verdicts, accepted closures, merged keyframes and restored state."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 
 VARIANCE = np.array([0.1, 0.1, 0.02])
 SCALES = (0.5, 2.0, 20.0)
+KEYFRAMES = 60
+number, odd = st.integers(0, 10), st.floats(-5, 30)
 steps = st.lists(
     st.one_of(
-        st.tuples(st.just("add"), st.booleans(), st.floats(-5, 30)),
-        st.tuples(st.just("judge"), st.integers(0, 10), st.sampled_from(Verdict)),
-        st.tuples(st.just("strike"), st.integers(0, 10), st.integers(0, 10)),
+        st.tuples(st.just("add"), st.booleans(), odd),
+        st.tuples(st.just("judge"), number, st.sampled_from(Verdict), st.none() | odd),
+        st.tuples(st.just("rate"), number, odd),
+        st.tuples(st.just("strike"), number, number),
     ),
     max_size=30,
 )
@@ -32,49 +35,56 @@ def filled():
 
 @given(steps)
 def test_the_log_is_a_list_of_candidates(steps):
-    log, rows, verdicts, odds, counts = ClosureLog(), [], [], {}, []
-    for kind, a, b in steps:
+    log, rows = ClosureLog(), []
+    known: list[list[float]] = []  # distance, verdict, weight and log odds of each sequence
+    counts: list[int] = []
+    for kind, a, *more in steps:
+        sequence = a % max(len(known), 1)
         if kind == "add":
-            follows = a and bool(verdicts)
-            candidate = Candidate(50 + len(rows), len(rows) // 2, len(rows) % 7 - 3, 0.5 + len(rows) / 99, b)
+            follows = bool(a and known)
+            candidate = Candidate(
+                50 + len(rows), len(rows) // 2, len(rows) % 7 - 3, 0.5 + len(rows) / 99, *more
+            )
             if not follows:
-                verdicts.append(Verdict.OPEN)
-            assert log.add(candidate, follows) == len(verdicts) - 1
-            rows.append([candidate, len(verdicts) - 1])
+                known.append([np.inf, Verdict.OPEN, 0.0, np.nan])
+            assert log.add(candidate, follows) == len(known) - 1
+            rows.append([candidate, len(known) - 1])
             assert log.last() == candidate
-        elif kind == "judge" and verdicts:
-            verdicts[a % len(verdicts)] = b
-            log.judge(a % len(verdicts), b)
-        elif kind == "rate" and verdicts:
-            odds[a % len(verdicts)] = b
-            log.raise_log_odds(np.array([a % len(verdicts)]), np.array([b]))
-        elif kind == "strike" and verdicts:
-            frame, spare = 50 + a, b % len(verdicts)
+        elif kind == "judge" and known:
+            verdict, distance = more
+            known[sequence][1:3] = verdict, float(verdict == Verdict.ACCEPTED)
+            known[sequence][0] = known[sequence][0] if distance is None else distance
+            log.judge(sequence, verdict, distance)
+        elif kind == "rate" and known:
+            _, verdict, _, before = known[sequence]  # the odds of an accepted sequence do not fall
+            known[sequence][3] = np.fmax(before, more[0]) if verdict == Verdict.ACCEPTED else more[0]
+            log.raise_log_odds(np.array([sequence]), np.array(more))
+        elif kind == "strike" and known:
+            frame, spare = 50 + a, more[0] % len(known)
             log.reject(frame, spare)
             for row in rows:
-                accepted = row[1] >= 0 and verdicts[row[1]] == Verdict.ACCEPTED
+                accepted = row[1] >= 0 and known[row[1]][1] == Verdict.ACCEPTED
                 if row[0].keyframe >= frame and accepted and row[1] != spare:
                     row[1] = -1
         # After every step, so that no cached rows survive a change.
-        counts = [
-            k
-            for k, (_, sequence) in enumerate(rows)
-            if sequence >= 0 and verdicts[sequence] == Verdict.ACCEPTED
-        ]
+        counts = [k for k, (_, of) in enumerate(rows) if of >= 0 and known[of][1] == Verdict.ACCEPTED]
         assert log.accepted_rows().tolist() == counts
-    assert log.sequences == len(verdicts)
-    assert [log.verdict(sequence) for sequence in range(log.sequences)] == verdicts
+    assert log.sequences == len(known)
+    scores = []
     for sequence in range(log.sequences):
         mine = [candidate for candidate, of in rows if of == sequence]
         assert log.members(sequence).tolist() == [[*c[:3], sequence] for c in mine]
-        assert log.score(sequence) == pytest.approx(sum(c.log_ratio for c in mine))
+        scores.append(sum(c.log_ratio for c in mine))
+        assert log.score(sequence) == pytest.approx(scores[-1])
+        assert log.sizes()[sequence] == len(mine)
+        first, last = log.spans()[sequence].tolist()
+        assert (first, last) == (mine[0].keyframe, mine[-1].keyframe) if mine else first > last
+    assert log.scores() == pytest.approx(scores, abs=1e-12)
+    assert [log.verdict(k) for k in range(len(known))] == log.verdicts().tolist() == [row[1] for row in known]
+    nothing = np.inf, Verdict.UNDONE, 0.0, np.nan
+    expected = [[*candidate, of, *(known[of] if of >= 0 else nothing)] for candidate, of in rows]
     table = log.table()
-    assert table.shape == (len(rows), 10)
-    assert table[:, :6].tolist() == [[*candidate, sequence] for candidate, sequence in rows]
-    assert table[:, 7].tolist() == [
-        verdicts[sequence] if sequence >= 0 else Verdict.UNDONE for _, sequence in rows
-    ]
-    assert np.array_equal(table[:, 9], [odds.get(sequence, np.nan) for _, sequence in rows], equal_nan=True)
+    assert np.array_equal(table, np.reshape(expected, (-1, 10)), equal_nan=True)
 
     closures = log.closures(0.2, VARIANCE, SCALES)
     mine = [rows[k] for k in counts]
@@ -83,74 +93,26 @@ def test_the_log_is_a_list_of_candidates(steps):
     assert closures.j.tolist() == [candidate.keyframe for candidate, _ in mine]
     assert np.allclose(closures.turn, [-0.2 * candidate.shift for candidate, _ in mine])
     assert closures.sequence.tolist() == [sequences.index(sequence) for _, sequence in mine]
-    assert np.allclose(closures.scale, [min(max(0.5 * log.score(sequence), 2), 20) for sequence in sequences])
+    assert closures.score == pytest.approx([scores[sequence] for sequence in sequences])
+    assert np.allclose(closures.scale, [min(max(0.5 * scores[sequence], 2), 20) for sequence in sequences])
     assert closures.variance is VARIANCE
 
     again = ClosureLog()
     again.add(Candidate(1, 0, 0, 1.0, 1.0), False)
     again.restore(log.arrays())
+    if known:  # what was saved are copies
+        log.judge(0, Verdict.UNDONE, 1.0)
     assert np.array_equal(again.table(), table, equal_nan=True)
-    assert np.array_equal(again.accepted_rows(), log.accepted_rows())
+    assert again.accepted_rows().tolist() == counts
     assert (again.sequences, again.last()) == (log.sequences, log.last())
-
-
-def test_an_empty_log_has_no_closures():
-    log = ClosureLog()
-    assert log.last() is None
-    assert log.sequences == 0
-    assert log.table().shape == (0, 10)
-    assert [len(rows) for rows in log.closures(0.1, VARIANCE, SCALES)[:4]] == [0] * 4
-    assert log.closures(0.1, VARIANCE, SCALES).scale.shape == (0,)
-    log.weigh(np.zeros(0))
-    assert log.weights().shape == (0,)
-
-
-def test_a_sequence_counts_while_it_is_accepted():
-    log = filled()
-    assert len(log.accepted_rows()) == 0
-    log.judge(1, Verdict.ACCEPTED, 3.0)
-    assert log.accepted_rows().tolist() == [2, 3, 4]
-    log.add(Candidate(62, 9, 0, 0.9, 1.0), True)  # of the open sequence 2
-    log.judge(2, Verdict.ACCEPTED)
-    assert log.accepted_rows().tolist() == [2, 3, 4, 5, 6]
-    log.add(Candidate(64, 9, 0, 0.9, 1.0), True)  # of a sequence accepted already
-    assert log.accepted_rows().tolist() == [2, 3, 4, 5, 6, 7]
-    log.judge(1, Verdict.UNDONE)
-    assert log.accepted_rows().tolist() == [5, 6, 7]
-    assert log.closures(0.1, VARIANCE, SCALES).sequence.tolist() == [0, 0, 0]
-
-
-def test_the_odds_of_an_accepted_sequence_do_not_fall():
-    log = filled()
-    log.raise_log_odds(np.array([0, 1]), np.array([3.0, 3.0]))
-    log.judge(0, Verdict.ACCEPTED)
-    log.judge(2, Verdict.ACCEPTED)
-    for odds in (1.0, 4.0, 2.0):
-        log.raise_log_odds(np.arange(3), np.full(3, odds))
-    assert log.table()[[0, 2, 5], 9].tolist() == [4.0, 2.0, 4.0]
-
-
-def test_a_break_strikes_out_later_candidates():
-    log = filled()
-    for sequence in (0, 1):
-        log.judge(sequence, Verdict.ACCEPTED)
-    log.reject(56, 2)
-    assert log.accepted_rows().tolist() == [0, 1, 2]  # sequence 1 keeps its candidates before the break
-    assert log.score(1) == 2.0
-    assert log.table()[:, 5].tolist() == [0, 0, 1, -1, -1, 2]  # an open sequence is spared, accepted or not
-    assert log.table()[3, 6:9].tolist() == [np.inf, Verdict.UNDONE, 0.0]
-    assert np.isnan(log.table()[3, 9])
-    log.judge(2, Verdict.ACCEPTED)
-    log.reject(0, 2)
-    assert log.accepted_rows().tolist() == [5]
 
 
 @given(steps, st.lists(st.integers(50, 85), max_size=3, unique=True))
 def test_no_sequence_lies_across_a_cut(steps, cuts):
     log, cuts = ClosureLog(), np.sort(np.array(cuts, int))
-    for k, (kind, a, b) in enumerate(steps):
+    for k, (kind, a, *more) in enumerate(steps):
         if kind == "add":
-            log.add(Candidate(50 + k, k, 0, 0.9, b), a and log.sequences > 0)
+            log.add(Candidate(50 + k, k, 0, 0.9, *more), a and log.sequences > 0)
     before = [log.members(sequence)[:, 0] for sequence in range(log.sequences)]
     log.reject_across(cuts)
     for sequence, frames in enumerate(before):
@@ -160,46 +122,6 @@ def test_no_sequence_lies_across_a_cut(steps, cuts):
         assert len(left) == largest
         assert len(np.unique(np.searchsorted(cuts, left, side="right"))) == 1
         assert np.isin(left, frames).all()
-
-
-@given(steps)
-def test_summaries_of_sequences_follow_from_their_members(steps):
-    log = ClosureLog()
-    for k, (kind, a, b) in enumerate(steps):
-        if kind == "add":
-            log.add(Candidate(50 + k, k, 0, 0.9, b), a and log.sequences > 0)
-        elif kind == "judge" and log.sequences:
-            log.judge(a % log.sequences, b)
-        elif kind == "strike" and log.sequences:
-            log.reject(50 + a, b % log.sequences)
-    members = [log.members(sequence) for sequence in range(log.sequences)]
-    assert log.sizes().tolist() == [len(rows) for rows in members]
-    assert log.scores() == pytest.approx(
-        [log.score(sequence) for sequence in range(log.sequences)], abs=1e-12
-    )
-    assert log.verdicts().tolist() == [log.verdict(sequence) for sequence in range(log.sequences)]
-    assert log.spans().shape == (log.sequences, 2)
-    for (first, last), rows in zip(log.spans().tolist(), members, strict=True):
-        if len(rows):
-            assert (first, last) == (rows[0, 0], rows[-1, 0])
-        else:
-            assert first > last
-
-
-def test_closures_have_the_evidence_of_their_sequences():
-    log = filled()
-    for sequence in (0, 2):
-        log.judge(sequence, Verdict.ACCEPTED)
-    closures = log.closures(0.1, VARIANCE, SCALES)
-    assert closures.score.tolist() == [2.0, 3.0]
-    assert closures.sequence.tolist() == [0, 0, 1]
-
-
-def test_scales_grow_with_the_score_between_their_limits():
-    log = filled()
-    for sequence in range(3):
-        log.judge(sequence, Verdict.ACCEPTED)
-    assert np.allclose(log.closures(0.1, VARIANCE, (1.0, 2.5, 4.0)).scale, [2.5, 4.0, 3.0])
 
 
 def test_weights_belong_to_the_accepted_sequences():
@@ -215,27 +137,136 @@ def test_weights_belong_to_the_accepted_sequences():
     assert log.weights().tolist() == [0.5]
 
 
-def test_the_table_has_all_evidence():
-    log = ClosureLog()
-    log.add(Candidate(30, 4, -2, 0.75, 6.5), False)
-    log.add(Candidate(40, 5, 1, 0.5, -1.5), False)
-    log.judge(0, Verdict.ACCEPTED, 2.25)
-    log.judge(0, Verdict.ACCEPTED)  # without a distance, the one known stays
-    log.weigh(np.array([0.5]))
-    log.raise_log_odds(np.array([1]), np.array([-0.75]))
-    expected = [
-        [30, 4, -2, 0.75, 6.5, 0, 2.25, Verdict.ACCEPTED, 0.5, np.nan],
-        [40, 5, 1, 0.5, -1.5, 1, np.inf, Verdict.OPEN, 0.0, -0.75],
-    ]
+def random_log(stream, sequences=5):
+    """Sequences of keyframes 30.. matched to 0..29, some accepted, the last candidates rejected."""
+    log, frame = ClosureLog(), 30
+    for _ in range(sequences):
+        for k in range(int(stream.integers(1, 7))):
+            evidence = stream.uniform(0.5, 1), stream.normal(3, 2)
+            log.add(
+                Candidate(frame, int(stream.integers(30)), int(stream.integers(2)), *map(float, evidence)),
+                k > 0,
+            )
+            frame += 1
+        log.judge(log.sequences - 1, stream.choice([Verdict.OPEN, Verdict.ACCEPTED]), 1.5)
+    log.reject(frame - 3, 0)
+    accepted = int((np.bincount(log.table()[log.accepted_rows(), 5].astype(int)) > 0).sum())
+    log.weigh(stream.uniform(0, 1, accepted))
+    return log
+
+
+def random_merge(stream):
+    """Which of `KEYFRAMES` keyframes are gone, the new numbers, and which are merged turned."""
+    gone = stream.random(KEYFRAMES) < 0.5
+    gone[0] = False
+    kept = np.flatnonzero(~gone)
+    onto = np.array([k if not gone[k] else stream.choice(kept[kept < k]) for k in range(KEYFRAMES)])
+    return gone, (np.cumsum(~gone) - 1)[onto], gone & (stream.random(KEYFRAMES) < 0.5)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_merge_keeps_the_evidence_of_every_sequence(seed):
+    stream = np.random.default_rng(seed)
+    log = random_log(stream)
+    whole = log.copy()
+    gone, onto, turned = random_merge(stream)
+    log.accepted_rows()  # remembered, and forgotten by the merge
+    log.merge(gone, onto, turned)
+    assert np.array_equal(log.sizes(), whole.sizes())
+    assert np.allclose(log.scores(), whole.scores())
+    assert [log.score(k) for k in range(log.sequences)] == pytest.approx(whole.scores().tolist())
+    assert np.array_equal(log.verdicts(), whole.verdicts())
+    assert np.array_equal(log.sequence_weights(), whole.sequence_weights())
+
+    before = whole.table()
+    left = before[~gone[before[:, 0].astype(int)]]
+    frame, match = left[:, :2].astype(int).T
+    expected = left.copy()
+    expected[:, 0], expected[:, 1] = onto[frame], onto[match]
+    expected[:, 2] = np.where(turned[match], 1 - left[:, 2], left[:, 2])
     assert np.array_equal(log.table(), expected, equal_nan=True)
+    rows = left[:, 5].astype(int)
+    assert log.left().tolist() == np.bincount(rows[rows >= 0], minlength=log.sequences).tolist()
+    merged = [bool((gone[whole.members(k)[:, 0]]).any()) for k in range(log.sequences)]
+    assert [log.has_merged(k) for k in range(log.sequences)] == merged
+
+    closures, accepted = log.closures(np.pi, np.ones(3), SCALES), log.table()[log.accepted_rows()]
+    sequences = np.unique(accepted[:, 5]).astype(int)
+    assert closures.j.tolist() == accepted[:, 0].tolist()
+    assert closures.i.tolist() == accepted[:, 1].tolist()
+    assert np.allclose(closures.score, log.scores()[sequences])
+    assert closures.size.tolist() == log.sizes()[sequences].tolist()
+    assert np.array_equal(np.bincount(closures.sequence, minlength=len(sequences)), log.left()[sequences])
 
 
-def test_saved_arrays_are_copies():
-    log = filled()
-    saved = log.arrays()
-    before = log.table()
-    log.judge(0, Verdict.ACCEPTED, 1.0)
-    log.reject(50, 2)
-    log.restore(saved)
-    assert np.array_equal(log.table(), before, equal_nan=True)
-    assert len(log.accepted_rows()) == 0
+def test_a_sequence_goes_on_after_it_was_merged():
+    log = ClosureLog()
+    for k in range(4):
+        log.add(Candidate(30 + k, k, 0, 1.0, 2.0), k > 0)
+    gone = np.isin(np.arange(40), [30, 31])
+    log.merge(gone, np.where(gone, np.arange(40) - 30, np.cumsum(~gone) - 1), np.zeros(40, bool))
+    assert log.last() == Candidate(31, 3, 0, 1.0, 2.0)
+    assert log.add(Candidate(32, 4, 0, 1.0, 2.0), True) == 0
+    assert (log.score(0), log.sizes().tolist(), log.left().tolist()) == (10.0, [5], [3])
+    again = ClosureLog()
+    again.restore(log.arrays())
+    assert (again.score(0), again.sizes().tolist(), again.has_merged(0)) == (10.0, [5], True)
+
+
+def judged(*weights):
+    """One sequence for each weight, accepted with it; None: open."""
+    log = ClosureLog()
+    for k, weight in enumerate(weights):
+        log.add(Candidate(30 + k, k, 0, 1.0, 2.0), False)
+        log.judge(k, Verdict.OPEN if weight is None else Verdict.ACCEPTED)
+    log.weigh(np.array([weight for weight in weights if weight is not None]))
+    return log
+
+
+def test_a_sequence_stands_selections_in_a_row():
+    log = judged(0.9, 0.5, None)
+    counts = []
+    for _ in range(3):
+        log.count_selection()
+        counts.append(log.confirmations().tolist())
+    assert counts == [[1, 0, 0], [2, 0, 0], [3, 0, 0]]
+    log.judge(2, Verdict.ACCEPTED)
+    log.weigh(np.array([0.4, 0.6, 1.0]))
+    log.count_selection()
+    assert log.confirmations().tolist() == [0, 1, 1]
+    log.judge(1, Verdict.OPEN)
+    log.count_selection()
+    assert log.confirmations().tolist() == [0, 0, 2]
+
+
+def test_sequences_are_confirmed_by_their_weight():
+    log = judged(0.9, 0.5, None, 0.8)
+    for _ in range(3):
+        log.count_selection()
+    log.weigh(np.array([0.9, 0.9, 0.4]))
+    log.confirm(2)
+    # The second has begun to count, the last no longer does.
+    assert log.confirmations().tolist() == [3, 2, 0, 3]
+    log.confirm(5)
+    assert log.confirmations().tolist() == [5, 5, 0, 3]
+
+
+def test_verdicts_are_taken_over_whatever_was_merged():
+    whole = judged(0.9, None, 0.7)
+    log = whole.copy()
+    log.merge(np.isin(np.arange(33), [30, 32]), np.arange(33), np.zeros(33, bool))
+    log.judge(1, Verdict.ACCEPTED, 2.5)
+    log.raise_log_odds(np.array([1]), np.array([4.0]))
+    log.judge(2, Verdict.UNDONE)
+    log.count_selection()
+    whole.accepted_rows()
+    whole.follow(log)
+    table = whole.table()
+    assert table[:, 7].tolist() == [Verdict.ACCEPTED, Verdict.ACCEPTED, Verdict.UNDONE]
+    assert table[:, 8].tolist() == [0.9, 1.0, 0.0]
+    assert table[1, [6, 9]].tolist() == [2.5, 4.0]
+    assert whole.confirmations().tolist() == [1, 1, 0]
+    assert whole.accepted_rows().tolist() == [0, 1]
+    assert whole.left().tolist() == [1, 1, 1]
+    log.judge(0, Verdict.OPEN)
+    assert whole.verdict(0) == Verdict.ACCEPTED

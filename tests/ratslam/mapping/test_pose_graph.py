@@ -1,16 +1,16 @@
-"""Laws of the pose-graph solvers, and their optimum on the M3500 graph."""
+"""Laws of the pose-graph solvers, their optimum on the M3500 graph, and maps written and read back."""
 
 from __future__ import annotations
 
 import warnings
 
+import networkx
 import numpy as np
 import pytest
 import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.classic.relaxation import relax
 from ratslam.mapping.pose_graph import (
     Edges,
     Termination,
@@ -19,9 +19,12 @@ from ratslam.mapping.pose_graph import (
     growing_equations,
     huber,
     least_squares,
+    read_json,
     write_g2o,
+    write_json,
 )
-from tactile.base.se2 import between, compose, integrate, wrap
+from tactile.base.errors import InputError
+from tactile.base.se2 import between, integrate
 from tests.helpers.g2o import read_g2o
 
 
@@ -50,14 +53,6 @@ def test_jacobians_are_the_derivatives(seed):
             ahead, behind = (difference_error(poses + by, *edges[:3]) for by in (step, -step))
             slope = (ahead[0] - behind[0]) / 2e-6
             assert np.allclose(slope[0], jacobian[0, :, axis], atol=1e-6, rtol=1e-4)
-
-
-@given(st.integers(0, 1000))
-def test_exact_graphs_are_solved_exactly(seed):
-    truth, edges = loops(np.random.default_rng(seed))
-    solved = least_squares(truth, edges)
-    assert solved.termination is Termination.CONVERGED
-    assert np.abs(solved.poses - truth).max() < 1e-9
 
 
 def reckoned(edges, count):
@@ -114,50 +109,16 @@ def test_a_graph_that_grows_is_solved_to_the_same_bits_as_one_that_was_loaded():
         assert kept.cost == pytest.approx(least_squares(truth[:count], part).cost, rel=1e-9)
 
 
-@given(st.integers(0, 200), st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-3, 3)))
-def test_a_moved_graph_has_the_moved_solution(seed, by):
-    truth, edges = loops(np.random.default_rng(seed), noise=(0.02, 0.01))
-    here = least_squares(truth, edges).poses
-    there = least_squares(compose(np.array(by), truth), edges).poses
-    gap = there - compose(np.array(by), here)
-    assert np.abs(gap[:, :2]).max() < 1e-5
-    assert np.abs(wrap(gap[:, 2])).max() < 1e-5
-
-
-def test_the_cost_under_heavy_heading_noise_is_chi_square():
-    """0.1 rad per step: the final cost is chi-square with as many degrees of freedom."""
-    for seed in range(5):
-        truth, edges = loops(np.random.default_rng(seed), 1200, 150, (0.02, 0.1))
-        solved = least_squares(truth, edges)
-        assert solved.termination is Termination.CONVERGED
-        free = 3 * (len(edges.i) - len(truth) + 1)
-        assert solved.cost < free + 5 * np.sqrt(2 * free)
-
-
 def test_robust_kernels_limit_the_influence_of_a_false_closure():
     truth, edges = loops(np.random.default_rng(0), noise=(0.02, 0.005))
     false = Edges(
         *(np.concatenate([a, b]) for a, b in zip(edges, ([3], [110], [[0, 0, 0]], [[1e4] * 3]), strict=True))
     )
     robust = np.arange(len(false.i)) >= len(truth) - 1
-    harm = {}
-    for name, kernel in {"huber": huber(1.0), "geman": geman_mcclure(9.0)}.items():
-        poses = least_squares(truth, false, kernel=kernel, robust=robust).poses
-        harm[name] = np.abs(poses - truth)[:, :2].max()
     plain = np.abs(least_squares(truth, false).poses - truth)[:, :2].max()
-    assert harm["geman"] < plain / 5
-    assert harm["huber"] < plain / 5
-
-
-def test_heavy_heading_noise_terminates_without_nan():
-    stream = np.random.default_rng(1)
-    truth, edges = loops(stream, 400, 60, (0.02, 0.1))
-    solved = least_squares(reckoned(edges, 400), edges, iterations=200)
-    assert np.isfinite(solved.poses).all()
-    assert solved.termination in (Termination.CONVERGED, Termination.NO_DECREASE)
-    better = least_squares(truth, edges, iterations=200)
-    assert np.isfinite(better.poses).all()
-    assert better.cost <= solved.cost * 1.001
+    for kernel in (huber(1.0), geman_mcclure(9.0)):
+        poses = least_squares(truth, false, kernel=kernel, robust=robust).poses
+        assert np.abs(poses - truth)[:, :2].max() < plain / 5
 
 
 def test_heading_drift_of_more_than_half_a_turn_is_corrected():
@@ -217,22 +178,61 @@ def test_m3500_reaches_the_optimum_of_gtsam(m3500):
     assert np.hypot(*(ours.poses[:, :2] - theirs).T).max() <= 1e-4
 
 
-def test_relaxation_leaves_exact_graphs_and_pulls_others_together():
-    truth, edges = loops(np.random.default_rng(2), 30, 5)
-    motion = edges.motion
-    length, bearing = np.hypot(motion[:, 0], motion[:, 1]), np.arctan2(motion[:, 1], motion[:, 0])
-    links = edges.i, edges.j, length, bearing, motion[:, 2]
-    assert np.abs(relax(truth, links, 20, 0.5) - truth).max() < 1e-12
-    bent = truth + np.random.default_rng(3).normal(0, 0.05, truth.shape)
-    errors = [np.abs(difference_error(relax(bent, links, n, 0.5), *edges[:3])[0]).max() for n in (0, 50)]
-    assert errors[1] < errors[0] / 5
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
 
 
-def test_g2o_files_read_back_exactly(tmp_path):
-    truth, edges = loops(np.random.default_rng(4), 20, 4)
-    write_g2o(tmp_path / "a.g2o", truth, edges)
-    poses, back = read_g2o(tmp_path / "a.g2o")
-    assert np.array_equal(poses, truth)
-    assert np.array_equal(back.motion, edges.motion)
-    write_g2o(tmp_path / "b.g2o", poses, back)
-    assert (tmp_path / "a.g2o").read_bytes() == (tmp_path / "b.g2o").read_bytes()
+def example(seed=0):
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(6, 3, 3))
+    i, j = np.arange(6), np.array([1, 2, 3, 4, 0, 2])
+    return rng.normal(size=(7, 3)), Edges(i, j, rng.normal(size=(6, 3)), half + np.swapaxes(half, 1, 2))
+
+
+@given(values=st.lists(FINITE, min_size=9, max_size=9))
+def test_g2o_reads_back_exactly(values, tmp_path_factory):
+    """Every finite float survives, bit for bit."""
+    path = tmp_path_factory.mktemp("g2o") / "map.g2o"
+    values = np.array(values)
+    poses = np.stack([values[:3], values[3:6]])
+    write_g2o(path, poses, Edges(np.array([0]), np.array([1]), values[None, 6:], np.ones((1, 3))))
+    again, edges = read_g2o(path)
+    assert again.tobytes() == poses.tobytes()
+    assert edges.motion.tobytes() == values[None, 6:].tobytes()
+    assert (edges.information == np.eye(3)).all()
+
+
+def test_g2o_keeps_full_information_and_the_same_map_is_the_same_bytes(tmp_path):
+    a, b = tmp_path / "a", tmp_path / "b"
+    poses, edges = example()
+    write_g2o(a, poses, edges)
+    again, read = read_g2o(a)
+    assert (again == poses).all()
+    for ours, theirs in zip(edges, read, strict=True):
+        assert (ours == theirs).all()
+    write_g2o(b, again, read)
+    assert a.read_bytes() == b.read_bytes()
+
+
+def test_json_reads_back_ids_numbers_flags_and_directions_exactly(tmp_path):
+    made = networkx.DiGraph()
+    made.add_node(0, x=0.1, y=1 / 3, heading=-1e-300, template=4)
+    made.add_node(1, x=1.0, y=2.0, heading=3.0, template=0)
+    made.add_edge(0, 1, dx=0.1, dy=2 / 3, dtheta=0.0, traversals=2, length=1.5, duration=3.0, closure=True)
+    a, b = tmp_path / "a", tmp_path / "b"
+    write_json(a, made)
+    again = read_json(a)
+    assert isinstance(again, networkx.DiGraph)
+    assert dict(again.nodes(data=True)) == dict(made.nodes(data=True))
+    assert list(again.edges(data=True)) == list(made.edges(data=True))
+    write_json(b, again)
+    assert a.read_bytes() == b.read_bytes()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "3", '{"nodes": 3, "edges": []}', '{"nodes": [{}]}'])
+def test_files_that_are_not_graphs_are_refused(tmp_path, text):
+    """The error names the file."""
+    path = tmp_path / "map.json"
+    path.write_text(text)
+    with pytest.raises(InputError) as raised:
+        read_json(path)
+    assert raised.value.where.startswith(str(path))

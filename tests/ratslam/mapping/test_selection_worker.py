@@ -10,7 +10,7 @@ import pytest
 from ratslam.mapping import selection_worker
 from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.selection_worker import DELAY, THREAD
-from tests.ratslam.mapping.map_cases import LAP, drive, new_map, sequence
+from tests.ratslam.mapping.map_cases import LAP, drive, new_map, same, sequence
 
 EVERY = 60
 SELECTED = {"select_every": EVERY}
@@ -18,12 +18,6 @@ BEGUN = 4 * EVERY
 """The first selection with closures to select from."""
 SEEN = sequence(LAP + 2, 2, 80, 5.0)
 LAST = LAP + 90
-
-
-def same(a, b):
-    first, second = a.arrays(), b.arrays()
-    assert first.keys() == second.keys()
-    return all(np.array_equal(first[name], second[name], equal_nan=True) for name in first)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +43,7 @@ def test_a_slow_selection_gives_the_same_bits(held, whole):
     slow = drive(new_map(**SELECTED), SEEN, last=BEGUN - 1)
     hold()
     drive(slow, SEEN, first=BEGUN - 1, last=BEGUN + DELAY - 1)
-    assert slow.keyframes().count > BEGUN  # the session went on while the selection was held back
+    assert slow.state.unmerged.count > BEGUN  # the session went on while the selection was held back
     gate.set()
     assert same(drive(slow, SEEN, first=BEGUN + DELAY - 1, last=LAST), whole)
 
@@ -68,31 +62,22 @@ def test_a_selection_in_progress_keeps_its_views_when_the_map_is_restored(held):
         assert np.array_equal(value, expected[f"selection/job/result/{name}"], equal_nan=True), name
 
 
-def test_the_result_is_taken_up_after_the_delay(monkeypatch):
+@pytest.mark.parametrize("every", [EVERY, 10])
+def test_the_result_is_taken_up_after_the_delay_or_before_the_next_selection(every, monkeypatch):
     taken = []
     real = selection_worker.SelectedMap.take_up
 
-    def take_up(self, graph, log):
-        taken.append((len(self.poses), graph.count))
-        real(self, graph, log)
+    def take_up(self, graph):
+        taken.append((len(self.poses), graph.count - len(self.poses)))
+        real(self, graph)
 
     monkeypatch.setattr(selection_worker.SelectedMap, "take_up", take_up)
-    drive(new_map(**SELECTED), SEEN, last=LAST)
-    assert taken == [(BEGUN, BEGUN + DELAY)]
-
-
-def test_frequent_selections_wait_for_each_other(monkeypatch):
-    taken = []
-    real = selection_worker.SelectedMap.take_up
-
-    def take_up(self, graph, log):
-        taken.append(graph.count - len(self.poses))
-        real(self, graph, log)
-
-    monkeypatch.setattr(selection_worker.SelectedMap, "take_up", take_up)
-    drive(new_map(select_every=10), SEEN, last=LAST)
-    assert set(taken) == {10}
-    assert len(taken) > 3
+    drive(new_map(select_every=every), SEEN, last=LAST)
+    if every == EVERY:
+        assert taken == [(BEGUN, DELAY)]
+    else:
+        assert {delay for _, delay in taken} == {every}
+        assert len(taken) > 3
 
 
 @pytest.mark.parametrize(

@@ -19,15 +19,13 @@ from ratslam.mapping.ground import Ground
 from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.odometry_calibration import HeadingNoise
 from ratslam.places.localiser import Localisation, Localiser, Place
-from tactile.base.se2 import between, compose, integrate
+from tactile.base.se2 import between, integrate
 from tactile.base.types import Observation, Odometry, observation
 from tests.ratslam.places.alignment_cases import (
-    POSES,
     REACH,
     SEEDS,
     assert_same_pose,
     ground_at,
-    moved_by,
     odds_of,
     square_loop,
 )
@@ -81,8 +79,8 @@ def drive(seed: int = 0, begin: int = 5, count: int = COUNT, views: Sequence[int
     return Drive([step(odometry) for odometry in steps], evidence, truth)
 
 
-def new_localiser(ground: Ground = LOOP.ground) -> Localiser:
-    return Localiser(Place(MAP, np.arange(len(ground.poses)), ground, ODDS), NEEDED)
+def new_localiser(ground: Ground = LOOP.ground, map: KeyframeMap = MAP, start=None) -> Localiser:
+    return Localiser(Place(map, np.arange(len(ground.poses)), ground, ODDS), NEEDED, start)
 
 
 def follow(localiser: Localiser, driven: Drive, first: int = 0) -> list[Estimate]:
@@ -96,7 +94,7 @@ def errors(localiser: Localiser, driven: Drive) -> np.ndarray:
     return np.hypot(*(localiser.trajectory() - driven.truth)[found][:, :2].T)
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(SEEDS)
 def test_a_session_on_the_map_is_found_where_it_is(seed: int) -> None:
     localiser, driven = new_localiser(), drive(seed)
@@ -116,7 +114,7 @@ def test_a_session_on_the_map_is_found_where_it_is(seed: int) -> None:
     assert localiser.pieces().tolist() == [int(state == FOUND) for state in states]
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(SEEDS)
 def test_shuffled_views_are_never_found(seed: int) -> None:
     order = np.random.default_rng(seed).permutation(COUNT).tolist()
@@ -140,26 +138,39 @@ def test_another_world_is_never_found_and_named_so() -> None:
     assert localiser.states()[-1] == FOUND  # it may come to mapped ground yet
 
 
-def test_a_carried_robot_is_lost_and_found_where_it_is() -> None:
-    before, after = drive(begin=5), drive(seed=1, begin=45)
-    localiser = new_localiser()
-    follow(localiser, before)
-    follow(localiser, after)
-    states = localiser.states()
+def test_a_carried_robot_is_lost_claims_nothing_and_is_found_where_it_is(tmp_path: Path) -> None:
+    localiser, after = carried(), drive(seed=1, begin=45)
+    for seen, evidence in zip(after.observations, after.evidence, strict=True):
+        localiser.update(seen, BLANK, evidence)
+        now = localiser.localisation()
+        assert now.state == FOUND or now.mass < 0.9 or now.log_odds < NEEDED
+    states, pieces = localiser.states(), localiser.pieces()
     assert (states[COUNT - 10 : COUNT] == FOUND).all()
-    changes = states[1:][np.diff(states) != 0].tolist()
-    assert changes == [FOUND, LOST, FOUND]
+    assert states[1:][np.diff(states) != 0].tolist() == [FOUND, LOST, FOUND]
     assert np.hypot(*(localiser.pose(BLANK) - after.truth[-1])[:2]) < REACH
     lost = int(np.argmax(states == LOST))
-    pieces = localiser.pieces()
     assert (pieces[0], pieces[lost - 1], pieces[lost], pieces[-1]) == (0, 1, 2, 1)
+
+    localiser.files()["localisation.csv"](tmp_path / "localisation.csv")
+    with (tmp_path / "localisation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [Localisation[row["state"].upper()] for row in rows] == states.tolist()
+    assert [int(row["step"]) for row in rows] == list(range(2 * COUNT))
+    assert (float(rows[-1]["mass"]), float(rows[-1]["log_odds"])) == (now.mass, now.log_odds)
+    deviation = np.sqrt(np.linalg.eigvalsh(now.covariance[:2, :2]).max())
+    assert float(rows[-1]["sd"]) == pytest.approx(deviation)
+
+
+def carried() -> Localiser:
+    """A robot that was found, and now is carried away."""
+    localiser = new_localiser()
+    follow(localiser, drive(begin=5))
+    assert localiser.states()[-1] == FOUND
+    return localiser
 
 
 def test_a_pose_that_odometry_alone_has_made_uncertain_is_lost_and_found_again() -> None:
-    there, back = drive(begin=5), drive(seed=1, begin=5 + COUNT)
-    localiser = new_localiser()
-    follow(localiser, there)
-    assert localiser.states()[-1] == FOUND
+    localiser, there, back = carried(), drive(begin=5), drive(seed=1, begin=5 + COUNT)
     nothing = Evidence(-1, -1, 0, 0.0, False, there.evidence[0].gain)
     away = [np.array([4.0, 0.0, 0.0])] * 100 + [np.array([-4.0, 0.0, 0.0])] * 100
     for odometry in away:  # far beyond the map and back, without a view
@@ -174,58 +185,31 @@ def test_a_pose_that_odometry_alone_has_made_uncertain_is_lost_and_found_again()
     assert np.hypot(*(localiser.pose(BLANK) - back.truth[-1])[:2]) < REACH
 
 
-def test_while_lost_nothing_is_claimed() -> None:
-    localiser = new_localiser()
-    follow(localiser, drive(begin=5))
-    for seen, evidence in zip(*drive(seed=1, begin=45)[:2], strict=True):
-        localiser.update(seen, BLANK, evidence)
-        now = localiser.localisation()
-        assert now.state == FOUND or now.mass < 0.9 or now.log_odds < NEEDED
-
-
 def test_without_views_the_pose_is_that_of_odometry() -> None:
+    """What a map learns of its odometry does not make that of others better."""
+
+    def spreads(localiser: Localiser) -> np.ndarray:
+        return np.array([localiser.update(seen, BLANK, nothing).spread for seen in driven.observations])
+
+    def learned(factor: float) -> np.ndarray:
+        made = new_map()
+        made.state.heading_noise = HeadingNoise(float(np.log(factor)))
+        return spreads(new_localiser(map=made))[-1]
+
     driven, localiser = drive(), new_localiser()
+    driven.observations[20] = step(np.array([np.nan, 0.0, np.inf]))  # what is not finite is left out
     nothing = Evidence(-1, -1, 0, 0.0, False, driven.evidence[0].gain)
-    spreads = [localiser.update(seen, BLANK, nothing).spread for seen in driven.observations]
+    spread = spreads(localiser)
     assert (localiser.states() == Localisation.SEARCHING).all()
-    expected = integrate(np.array([seen.odometry[:3] for seen in driven.observations]))
+    expected = integrate(np.nan_to_num([seen.odometry[:3] for seen in driven.observations], posinf=0.0))
     assert_same_pose(localiser.trajectory(), expected)
-    assert np.diff([spread.max() for spread in spreads]).min() >= 0
-    assert spreads[-1].min() > 0
+    assert np.diff(spread.max(axis=1)).min() >= 0
+    assert spread[-1].min() > 0
+    assert learned(0.5) == pytest.approx(spread[-1])
+    assert learned(4.0)[2] > 1.5 * spread[-1, 2]
 
 
-def test_what_a_map_learns_of_its_odometry_does_not_make_that_of_others_better() -> None:
-    def heading_spread(factor: float) -> float:
-        made, driven = new_map(), drive()
-        made.kept_keyframes().heading_noise = HeadingNoise(float(np.log(factor)))
-        localiser = Localiser(Place(made, np.arange(len(LOOP.poses)), LOOP.ground, ODDS), NEEDED)
-        nothing = Evidence(-1, -1, 0, 0.0, False, driven.evidence[0].gain)
-        return float([localiser.update(seen, BLANK, nothing) for seen in driven.observations][-1].spread[2])
-
-    assert heading_spread(0.5) == pytest.approx(heading_spread(1.0))
-    assert heading_spread(4.0) > 1.5 * heading_spread(1.0)
-
-
-def test_odometry_that_is_not_finite_is_left_out() -> None:
-    driven, localiser = drive(), new_localiser()
-    driven.observations[20] = step(np.array([np.nan, 0.0, np.inf]))
-    follow(localiser, driven)
-    assert np.isfinite(localiser.trajectory()).all()
-    assert localiser.states()[-1] == FOUND
-
-
-@settings(max_examples=5)
-@given(POSES)
-def test_the_pose_moves_with_the_map(change: np.ndarray) -> None:
-    one, other, driven = new_localiser(), new_localiser(moved_by(change, LOOP.ground)), drive()
-    follow(one, driven)
-    follow(other, driven)
-    np.testing.assert_array_equal(other.states(), one.states())
-    found = one.states() == FOUND
-    assert_same_pose(other.trajectory()[found], compose(change, one.trajectory()[found]), 1e-6)
-
-
-@pytest.mark.parametrize("stop", [1, 4, 12, 30, COUNT + 8, COUNT + 25])
+@pytest.mark.parametrize("stop", [4, 12, COUNT + 8])
 def test_a_restored_session_goes_on_to_the_same_bits(stop: int) -> None:
     """Stopped while it searches, when it is found, and while it is lost."""
     halves = drive(begin=5), drive(seed=1, begin=45)
@@ -254,42 +238,15 @@ def test_a_session_in_a_map_that_has_changed_is_refused() -> None:
         changed.restore(localiser.arrays())
 
 
-def test_a_map_of_one_keyframe_finds_nothing_and_fails_nowhere() -> None:
-    localiser = new_localiser(ground_at(np.zeros(3)))
-    driven = drive(count=40)
-    alone = [evidence._replace(gain=evidence.gain[:, :1], match=0) for evidence in driven.evidence]
-    follow(localiser, driven._replace(evidence=alone))
-    assert FOUND not in localiser.states()
-    assert np.isfinite(localiser.trajectory()).all()
-
-
-def test_the_file_of_a_localisation_names_states(tmp_path: Path) -> None:
-    localiser = new_localiser()
-    follow(localiser, drive(begin=5))
-    follow(localiser, drive(seed=1, begin=45))
-    localiser.files()["localisation.csv"](tmp_path / "localisation.csv")
-    with (tmp_path / "localisation.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    names = {Localisation[row["state"].upper()] for row in rows}
-    assert [Localisation[row["state"].upper()] for row in rows] == localiser.states().tolist()
-    assert names == {Localisation.SEARCHING, FOUND, LOST}
-    assert [int(row["step"]) for row in rows] == list(range(2 * COUNT))
-    last = localiser.localisation()
-    assert float(rows[-1]["mass"]) == last.mass
-    assert float(rows[-1]["log_odds"]) == last.log_odds
-    deviation = np.sqrt(np.linalg.eigvalsh(last.covariance[:2, :2]).max())
-    assert float(rows[-1]["sd"]) == pytest.approx(deviation)
-
-
 def begun_at(start: np.ndarray, driven: Drive) -> Localiser:
     """A session that is supposed to begin at `start` [3] in the map."""
-    localiser = Localiser(Place(MAP, np.arange(len(LOOP.poses)), LOOP.ground, ODDS), NEEDED, start)
+    localiser = new_localiser(start=start)
     assert localiser.localisation().state == FOUND
     follow(localiser, driven)
     return localiser
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(SEEDS)
 def test_a_supposed_start_is_believed_from_the_first_step(seed: int) -> None:
     driven = drive(seed)
@@ -298,7 +255,7 @@ def test_a_supposed_start_is_believed_from_the_first_step(seed: int) -> None:
     assert (errors(localiser, driven) < REACH).all()
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(SEEDS)
 def test_views_that_contradict_a_supposed_start_remove_it(seed: int) -> None:
     driven = drive(seed)

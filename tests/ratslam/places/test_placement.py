@@ -1,4 +1,4 @@
-"""Placements of a session on a ring of keyframes whose views are made up."""
+"""Placements of a session on a ring of keyframes whose views are made up; a solved piece is a rigid body."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ratslam.mapping.ground import Ground, Motion, learn_gain_odds
-from ratslam.places.placement import Comparison, Traverse, find_placements
+from ratslam.places.placement import TOGETHER, Comparison, Traverse, find_placements
 from tactile.base.se2 import between, compose
 
 COUNT, RADIUS = 200, 2.0
@@ -71,3 +71,61 @@ def test_few_recalled_poses_propose_nothing(agreeing):
     recalled = np.full(COUNT, -1)
     recalled[20 : 20 + agreeing] = place[20 : 20 + agreeing]
     assert not find_placements(ground_of(ring()), ODDS, compared(place, recalled, COUNT))
+
+
+GAP = range(70, 130)
+"""Keyframes of the ring that the ground does not have."""
+HELD = np.setdiff1d(np.arange(COUNT), GAP)
+MIN_LOG_ODDS = -60.0
+
+
+def half_known(recalled: np.ndarray, turn: float) -> Traverse:
+    """The whole ring over ground without the gap; its motions lead astray in the gap.
+
+    Args:
+        turn: error of each motion there, rad.
+    """
+    place = np.full(COUNT, -1)
+    place[HELD] = np.arange(len(HELD))
+    session = compared(place, np.where(recalled >= 0, place, -1), len(HELD))
+    for k in GAP:
+        astray = session.motions[k].motion + np.array([0.0, 0.0, turn])
+        session.motions[k] = Motion(astray, session.motions[k].variance)
+    return Traverse(session.views, session.motions, MIN_LOG_ODDS, ring())
+
+
+def error(poses: np.ndarray, rows: slice) -> float:
+    return float(np.hypot(*(poses - compose(MOVED, ring()))[rows, :2].T).max())
+
+
+@pytest.mark.parametrize("turn", [0.01, -0.01])
+def test_a_piece_comes_back_to_the_ground_where_it_is_as_a_rigid_body(turn: float) -> None:
+    ground, back = ground_of(compose(MOVED, ring()[HELD])), slice(GAP.stop, COUNT)
+    piece = half_known(np.where(np.arange(COUNT) < 60, 0, -1), turn)
+    (path,) = find_placements(ground, ODDS, piece)
+    assert error(path.poses, back) < 0.01
+    assert (path.odds[back] > 0).all()
+    (astray,) = find_placements(ground, ODDS, Traverse(piece.views, piece.motions, -np.inf))
+    assert error(astray.poses, back) > 0.1
+    assert astray.odds.sum() < path.odds.sum() - COUNT / 4
+
+
+def test_the_whole_piece_is_placed_from_any_keyframe_in_the_same_way() -> None:
+    ground = ground_of(compose(MOVED, ring()[HELD]))
+    piece = half_known(np.zeros(COUNT, int), 0.0)
+    one, other = (piece.follow(ground, ODDS, k, compose(MOVED, ring()[k])) for k in (20, 180))
+    np.testing.assert_allclose(one.poses, other.poses, atol=1e-3)
+    np.testing.assert_array_equal(one.odds, other.odds)
+
+
+def test_a_few_confirmed_places_do_not_make_a_rigid_body() -> None:
+    place = np.where(np.arange(COUNT) < TOGETHER - 1, np.arange(COUNT), -1)
+    session = compared(place, place, COUNT)
+    ground = ground_of(compose(MOVED, ring()))
+    piece = Traverse(session.views, session.motions, MIN_LOG_ODDS, ring())
+    pose = compose(MOVED, ring()[0])
+    way = Traverse(session.views, session.motions, MIN_LOG_ODDS).follow(ground, ODDS, 0, pose)
+    found = piece.follow(ground, ODDS, 0, pose)
+    assert found.first == way.first
+    np.testing.assert_array_equal(found.odds, way.odds)
+    assert len(found.poses) < COUNT

@@ -110,6 +110,7 @@ def test_the_robot_turns_where_experiences_of_one_piece_share_a_place():
     assert find_way(made, 0, [3]).experiences == (0, 3)
     assert made.edges[0, 3]["seconds"] == pytest.approx(np.pi / TRAVEL.turn_rate)
     assert experiences_near(made, 0, 0.02) == [0, 3]
+    assert nearest_experience(travel_graph(networkx.DiGraph(), TRAVEL), np.zeros(2), np.inf) is None
     assert nearest_experience(made, np.array([0.0, 0.0, 3.0]), 0.1, heading_radius=0.2) == 3
 
 
@@ -125,7 +126,3 @@ def test_pieces_are_not_joined_even_where_they_overlap():
         find_way(travel_graph(graph, TRAVEL, wall, 0.02), 0, [1])
     with pytest.raises(KeyError, match="no experience 9"):
         find_way(travel_graph(graph, TRAVEL), 0, [9])
-
-
-def test_an_empty_map_has_no_nearest_experience():
-    assert nearest_experience(travel_graph(networkx.DiGraph(), TRAVEL), np.zeros(2), np.inf) is None

@@ -1,16 +1,31 @@
-"""The scan over calibrations of the odometry equals explicit dead reckoning with each of them, and its bits
-do not depend on when it is asked."""
+"""Odds of closure sequences: the scan over calibrations of the odometry, the vote on these and the null of
+scores equal slow sums; the bits of the scan do not depend on when it is asked."""
 
 from __future__ import annotations
+
+from itertools import product
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ratslam.mapping.acceptance import (
+    LEAST_SCORE,
+    LEAST_TURN_ERROR,
+    MIN_TRUE,
+    PRIOR_COUNT,
+    PRIOR_EXCESS,
+    PRIOR_KEYFRAMES,
+    PRIOR_SEQUENCES,
+    SHRINK,
+    TRUE_MEAN,
+    estimate_null,
+    log_odds,
+    vote,
+)
 from ratslam.mapping.appearance import ViewAppearance
-from ratslam.mapping.config import FULL, KeyframeMapConfig
-from ratslam.mapping.keyframe_graph import KeyframeGraph
+from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.odometry_scan import (
     BIAS_SPAN,
     BIAS_STEPS,
@@ -22,10 +37,10 @@ from ratslam.mapping.odometry_scan import (
 )
 from ratslam.mapping.optimizer import CalibrationPrior
 from tactile.base.se2 import compose, correct_heading, wrap
+from tests.ratslam.mapping.map_cases import add, new_graph
 
 CELL, GUARD, ANGLE, TURN_SD = 0.2, 5, 0.15, 0.08
-CONFIG = KeyframeMapConfig(turn_error_sd=TURN_SD)
-STRAIGHT = KeyframeMapConfig(turn_error_sd=0.0)
+CONFIG, STRAIGHT = KeyframeMapConfig(turn_error_sd=TURN_SD), KeyframeMapConfig(turn_error_sd=0.0)
 BIASES = np.linspace(-BIAS_SPAN, BIAS_SPAN, BIAS_STEPS) / CELL
 TURNS = np.linspace(-TURN_SPAN, TURN_SPAN, TURN_STEPS) * TURN_SD
 ALL = np.arange(BIAS_STEPS * TURN_STEPS)
@@ -42,7 +57,7 @@ def path(seed, count):
 
 
 def graph_of(rows, cut=None, config=CONFIG):
-    graph = KeyframeGraph(config, CELL, ViewAppearance(6, 6 * ANGLE), GUARD, FULL)
+    graph = new_graph(CELL, GUARD, ViewAppearance(6, 6 * ANGLE), turn_error_sd=config.turn_error_sd)
     extend(graph, rows)
     if cut is not None:
         graph.cut.rows[cut] = 0
@@ -51,7 +66,7 @@ def graph_of(rows, cut=None, config=CONFIG):
 
 def extend(graph, rows):
     for row in rows:
-        graph.append(np.zeros(3), row[:3], row[3], row[4])
+        add(graph, row[:3], np.zeros(3), row[3], row[4])
 
 
 def scanned(graph, member):
@@ -74,7 +89,7 @@ def propagated(graph, poses, i, j):
     for k in range(i + 1, j + 1):
         dx, dy = (poses[k] - poses[k - 1])[:2]
         onwards = np.array([[1, 0, -dy], [0, 1, dx], [0, 0, 1.0]])
-        covariance = onwards @ covariance @ onwards.T + np.diag(graph.variances(graph.cut)[k])
+        covariance = onwards @ covariance @ onwards.T + np.diag(graph.variances()[k])
     return covariance
 
 
@@ -92,16 +107,13 @@ def slow_log_ratio(graph, member, calibration):
     return max(np.log(len(density)) + density[i] - total, UNLIKELY)
 
 
-def test_the_grid_holds_every_pair_of_bias_and_turn_error():
+def test_the_grid_holds_every_pair_of_bias_and_turn_error_if_turns_may_err():
     grid = OdometryScan(graph_of(path(0, 3))).grid
     pairs = {(round(bias, 9), round(turn, 9)) for bias in BIASES for turn in TURNS}
     assert {(round(bias, 9), round(turn, 9)) for bias, turn in grid.tolist()} == pairs
     assert len(grid) == len(pairs)
-
-
-def test_without_turn_errors_the_grid_is_that_of_biases():
-    grid = OdometryScan(graph_of(path(0, 3), config=STRAIGHT)).grid
-    assert np.array_equal(grid, np.stack([BIASES, np.zeros(BIAS_STEPS)], axis=1))
+    straight = OdometryScan(graph_of(path(0, 3), config=STRAIGHT)).grid
+    assert np.array_equal(straight, np.stack([BIASES, np.zeros(BIAS_STEPS)], axis=1))
 
 
 @settings(max_examples=15)
@@ -117,32 +129,6 @@ def test_ratios_equal_explicit_dead_reckoning(seed, count, broken, config):
         expected = slow_log_ratio(graph, member.tolist(), scan.grid[at])
         # Positions are kept in single precision.
         assert found[at] == pytest.approx(expected, rel=1e-4, abs=1e-4)
-
-
-@settings(max_examples=10)
-@given(seeds)
-def test_without_turn_errors_the_ratios_are_those_of_the_turn_error_zero(seed):
-    rows, member = path(seed, 70), np.array([60, 9, 1])
-    both, alone = scanned(graph_of(rows), member), scanned(graph_of(rows, config=STRAIGHT), member)
-    assert both.reshape(BIAS_STEPS, TURN_STEPS)[:, TURN_STEPS // 2] == pytest.approx(
-        alone, rel=1e-4, abs=1e-4
-    )
-
-
-def test_the_covariance_is_that_of_noisy_paths():
-    """The reference's covariance, by paths with noise drawn at random."""
-    graph, calibration = graph_of(path(3, 60)), (0.1, -0.1)
-    poses, stream = reckoned(graph, calibration), np.random.default_rng(0)
-    i, j, draws = 10, 50, 40_000
-    noise = stream.normal(0, 1, (j + 1, draws, 3)) * np.sqrt(graph.variances(graph.cut)[: j + 1, None])
-    at = np.tile(poses[i], (draws, 1))
-    for k in range(i + 1, j + 1):
-        step = correct_heading(graph.motion.rows[k], graph.length.rows[k], *calibration)
-        at = compose(at, np.broadcast_to(step, at.shape)) + noise[k]
-    drawn = np.cov((at - poses[j])[:, :2].T)
-    expected = propagated(graph, poses, i, j)
-    assert drawn == pytest.approx(expected[:2, :2], rel=0.15, abs=0.05 * np.trace(drawn))
-    assert np.var(wrap(at - poses[j])[:, 2]) == pytest.approx(expected[2, 2], rel=0.05)
 
 
 @settings(max_examples=6)
@@ -177,14 +163,6 @@ def test_a_cut_counts_from_the_next_question_on():
     assert np.array_equal(scan.log_ratios(graph, member, ALL), whole)
 
 
-def test_poses_of_the_map_do_not_matter():
-    graph, member = graph_of(path(1, 80)), np.array([70, 10, 0])
-    before = scanned(graph, member)
-    graph.pose.rows[:] = np.random.default_rng(0).normal(0, 5, graph.pose.rows.shape)
-    graph.bias, graph.turn_error = 0.2, 0.1
-    assert np.array_equal(scanned(graph, member), before)
-
-
 @given(st.floats(-0.4, 0.4), st.floats(1e-6, 0.2), st.sampled_from([0.01, 0.05, 0.5]), st.booleans())
 @settings(max_examples=40)
 def test_what_lies_beyond_the_reach_is_left_out(mean, sd, turn_sd, turning):
@@ -209,34 +187,83 @@ def test_what_lies_beyond_the_reach_is_left_out(mean, sd, turn_sd, turning):
     assert np.isnan(np.delete(found, near)).all()
 
 
-def lap(turn, bias, turn_error, count=40):
-    """Rows of a circle of radius 1 m, of which every step truly turns by `turn`, measured with a calibration
-    that lacks both corrections."""
-    step = 2 * np.pi / count
-    measured = (turn - bias * step) / (1 + turn_error)
-    missing = (measured - turn) / 2
-    return np.tile(
-        [step * np.cos(missing), step * np.sin(missing), measured, step, abs(measured)], (count, 1)
-    )
+LEAST = 1e-3
 
 
-def test_a_bias_that_leads_back_to_the_place_is_favoured():
-    """Laps of a circle, measured with a heading bias: closures of equal places show it."""
-    graph = graph_of(np.tile(lap(2 * np.pi / 40, 0.15, 0.0), (3, 1)), config=STRAIGHT)
-    biases = OdometryScan(graph).grid[:, 0]
-    found = sum(scanned(graph, np.array([j, j - 40 * laps, 0])) for j, laps in [(100, 2), (110, 1)])
-    assert biases[found.argmax()] == pytest.approx(0.15, abs=0.02)
-    assert found.max() > 1 > found[biases < 0].max()
+def random_case(seed, sequences=None, points=5):
+    """Biases and turn errors [G, 2], a prior, log ratios [R, G] and log odds [R]."""
+    stream = np.random.default_rng(seed)
+    count = int(stream.integers(0, 6)) if sequences is None else sequences
+    grid = stream.uniform(-0.1, 0.1, (points, 2))
+    turn_sd = float(stream.uniform(0.01, 0.1)) if stream.random() < 0.7 else 0.0
+    prior = CalibrationPrior(*stream.uniform([-0.08, 0.01, -0.08], [0.08, 0.1, 0.08]).tolist(), turn_sd)
+    if turn_sd == 0:
+        grid[:, 1] = prior.turn_error
+    ratios = np.maximum(stream.normal(-2, 5, (count, points)), -60)
+    return grid, prior, ratios, stream.normal(-1, 2, count)
 
 
-@pytest.mark.parametrize("bias", [0.0, 0.1])
-@pytest.mark.parametrize("turn_error", [-0.12, 0.06])
-def test_a_turn_error_is_told_from_a_bias_by_turns_to_both_sides(bias, turn_error):
-    """Laps to the left and to the right: a heading bias opens one and shuts the other, a turn error acts on
-    both alike."""
-    left, right = (lap(side * 2 * np.pi / 40, bias, turn_error) for side in (1, -1))
-    graph = graph_of(np.concatenate([left, left, right, right]))
-    grid = OdometryScan(graph).grid
-    found = sum(scanned(graph, np.array([j, i, 0])) for j, i in [(75, 35), (70, 30), (155, 115), (150, 110)])
-    assert grid[found.argmax()] == pytest.approx([bias, turn_error], abs=0.021)
-    assert found.max() > 1 > found[grid[:, 1] * turn_error < 0].max()
+def prior_weight(grid, prior):
+    """[G] prior probability of each point, not normalised."""
+    weight = np.exp(-0.5 * ((grid[:, 0] - prior.bias) / prior.bias_sd) ** 2)
+    if prior.turn_error_sd:
+        weight = weight * np.exp(-0.5 * ((grid[:, 1] - prior.turn_error) / prior.turn_error_sd) ** 2)
+    return weight
+
+
+def joint_by_assignments(grid, prior, ratios, odds):
+    """For each assignment of true and false to the sequences: it, and its weight at every point [G]."""
+    for true in product([False, True], repeat=len(odds)):
+        weight = prior_weight(grid, prior)
+        for r in np.flatnonzero(true):
+            weight = weight * np.exp(odds[r] + ratios[r])
+        yield np.array(true, bool), weight
+
+
+@given(seeds)
+def test_means_and_odds_equal_the_sum_over_all_assignments(seed):
+    case = random_case(seed)
+    grid, prior, _, odds = case
+    total, of_true, of_false = np.zeros(len(grid)), np.zeros(len(odds)), np.zeros(len(odds))
+    for true, weight in joint_by_assignments(*case):
+        total += weight
+        of_true += true * weight.sum()
+        of_false += ~true * weight.sum()
+    share = total / total.sum()
+    mean = share @ grid
+    found = vote(*case, LEAST)
+    assert found[1][::2] == pytest.approx(mean, abs=1e-9)
+    assert found[2] == pytest.approx(np.log(of_true) - np.log(of_false), rel=1e-6, abs=1e-6)
+    spread = np.sqrt(share @ (grid - mean) ** 2)
+    wide = np.hypot(spread, mean - found[0][::2])
+    expected = np.maximum(wide, (LEAST, LEAST_TURN_ERROR)) * (1, prior.turn_error_sd > 0)
+    assert found[0][1::2] == pytest.approx(expected, rel=1e-6)
+    off, kept = mean - prior[::2], found[0][::2] - np.array(prior[::2])
+    shrunk = off * np.maximum(1 - (SHRINK * spread / np.where(off, off, np.inf)) ** 2, 0)
+    assert kept == pytest.approx(shrunk, rel=1e-6, abs=1e-9)
+
+
+nulls = st.tuples(st.floats(0.05, 500), st.floats(0.5, 0.9 * TRUE_MEAN))
+
+
+@given(st.lists(st.floats(-20, 200), min_size=1, max_size=40).map(np.array), st.integers(1, 3000), seeds)
+def test_the_null_of_a_sequence_follows_from_the_others_above_the_least_score(scores, keyframes, seed):
+    scores[0] = LEAST_SCORE if seed % 3 else scores[0]
+    false = np.random.default_rng(seed).uniform(0, 1, len(scores))
+    found = estimate_null(scores, false, keyframes)
+    for k in range(len(scores)):
+        others = [n for n in range(len(scores)) if n != k and scores[n] >= LEAST_SCORE]
+        count = sum(false[n] for n in others)
+        above = sum(false[n] * (scores[n] - LEAST_SCORE) for n in others)
+        mean = (above + PRIOR_COUNT * PRIOR_EXCESS) / (count + PRIOR_COUNT)
+        rate = (PRIOR_SEQUENCES + count) / (PRIOR_KEYFRAMES + keyframes)
+        assert found[0][k] == pytest.approx(keyframes * rate, rel=1e-9)
+        assert found[1][k] == pytest.approx(min(mean, TRUE_MEAN), rel=1e-9, abs=1e-9)
+
+
+@given(st.floats(0, 100), nulls, st.floats(0, 500))
+def test_odds_are_true_over_false_sequences_per_score(score, null, known):
+    true = max(known, MIN_TRUE) * np.exp(-score / TRUE_MEAN) / TRUE_MEAN
+    false = null[0] * np.exp(-(score - LEAST_SCORE) / null[1]) / null[1]
+    expected = np.log(true) - np.log(false)
+    assert log_odds(np.array([score]), *null, known)[0] == pytest.approx(expected, abs=1e-9)
