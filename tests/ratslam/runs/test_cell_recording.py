@@ -1,4 +1,4 @@
-"""Recorded pose cells: those of the network, the same bits of everything else, Ctrl-C, refusals."""
+"""Recorded pose cells: those of the network of both methods, the same bits of all else, Ctrl-C, refusals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ratslam
-from ratslam.classic.cell_probe import active_cells
+from ratslam.classic.cell_probe import active_cells, choose_cells
 from ratslam.classic.levels import to_full_torus
 from ratslam.examples import dead_reckoning
 from ratslam.methods.method_registry import Sensors
@@ -46,14 +46,14 @@ def walk():
     )  # fmt: skip
 
 
-def session_of(walk, cells):
-    return build_session(LoopConfig.model_validate({**METHOD, "cells": cells}), walk)
+def config_of(cells, method=METHOD):
+    return LoopConfig.model_validate({**method, "cells": cells})
 
 
 @pytest.fixture(scope="module")
 def live(walk):
     """A session that records, its steps one at a time, and the whole torus after each."""
-    session = session_of(walk, CELLS)
+    session = build_session(config_of(CELLS), walk)
     whole = jax.jit(partial(to_full_torus, session.backend.window_levels))
     steps, torus = [], []
     for sample in walk:
@@ -77,6 +77,32 @@ def test_recorded_activity_is_that_of_the_state_after_each_step(live):
             np.testing.assert_array_equal(np.bincount(cell, active, len(single[k])), single[k])
 
 
+def test_recall_records_the_same_live_and_in_replay(walk):
+    again = walk.views[np.arange(STEPS) // 5 % 20 * 5]  # the same at the same place of both circles
+    walk = replace(walk, views=again)
+    session = build_session(config_of({**CELLS, "chosen": 400}, {"backend": "recall"}), walk)
+    cells = session.backend.probe()
+    whole = jax.jit(partial(cells.each, chosen=np.arange(np.prod(cells.shape))))
+    steps, torus = [], []
+    for sample in walk:
+        steps.append(session.step(sample.reading))
+        torus.append(np.asarray(whole(session.state)))
+    drawn = np.array([step.probed for step in steps])
+    assert drawn.dtype == np.float32
+    assert (drawn > 0).any()
+    chosen = choose_cells(400, cells.shape, seed=0)
+    np.testing.assert_allclose(drawn, np.array(torus)[:, chosen], rtol=1e-4, atol=1e-9)
+    check_replay(session, walk, steps)
+
+
+def check_replay(session, walk, steps):
+    session.restart()
+    again = session.replay([sample.reading for sample in walk][: len(steps)])
+    for one, other in zip(steps, again, strict=True):
+        np.testing.assert_array_equal(one.probed, other.probed)
+        jax.tree.map(np.testing.assert_array_equal, one.seldom, other.seldom)
+
+
 def leaves(steps):
     return [np.concatenate([np.ravel(x) for x in (*s.estimate, *s.evidence, s.pose)]) for s in steps]
 
@@ -84,15 +110,10 @@ def leaves(steps):
 def test_replay_equals_live_and_recording_changes_no_bit(live, walk):
     session, steps, _ = live
     state, trajectory = session.arrays(), session.map.trajectory()
-    readings = [sample.reading for sample in walk]
-    session.restart()
-    again = list(session.replay(readings))
+    check_replay(session, walk, steps)
     assert session.compilations() == 1
-    for one, other in zip(steps, again, strict=True):
-        np.testing.assert_array_equal(one.probed, other.probed)
-        jax.tree.map(np.testing.assert_array_equal, one.seldom, other.seldom)
-    plain = session_of(walk, None)
-    off = list(plain.replay(readings))
+    plain = build_session(config_of(None), walk)
+    off = list(plain.replay([sample.reading for sample in walk]))
     assert off[0].probed is None
     np.testing.assert_array_equal(leaves(off), leaves(steps))
     np.testing.assert_array_equal(plain.map.trajectory(), trajectory)
@@ -101,9 +122,12 @@ def test_replay_equals_live_and_recording_changes_no_bit(live, walk):
 
 
 def run(walk, directory, cells=CELLS, resume=None):
-    config = LoopConfig.model_validate({**METHOD, "cells": cells})
-    with open_runner(config, walk, directory, resume) as runner:
-        runner.finish(process_source(runner, walk))
+    """An unfinished run has rows and no recording."""
+    with open_runner(config_of(cells), walk, directory, resume) as runner:
+        interrupted = process_source(runner, walk)
+        assert (directory / ROWS).exists() == (cells is not None)
+        assert not (directory / "cells.npz").exists()
+        runner.finish(interrupted)
     return ratslam.Result(directory)
 
 
@@ -130,16 +154,14 @@ def test_sums_are_those_of_the_whole_recording(result, live, walk):
     _, _, torus = live
     sums, due = result.cells.sums, np.arange(4, STEPS - 10, 5)
     pose, seconds = walk.truth[due], np.diff(walk.time[due], prepend=0.0)
-    edges = [sums.y_edges, sums.x_edges]
-    at = [pose[:, 1], pose[:, 0]]
+    edges, at = [sums.y_edges, sums.x_edges], [pose[:, 1], pose[:, 0]]
     expected = np.array([np.histogram2d(*at, edges, weights=seconds * one)[0] for one in torus[due].T])
     np.testing.assert_allclose(sums.seconds, np.histogram2d(*at, edges, weights=seconds)[0], rtol=1e-9)
     np.testing.assert_allclose(sums.place, expected, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(sums.place.sum(axis=0), sums.seconds, rtol=1e-5)
     headings = np.round(pose[:, 2] / (2 * np.pi) * 8).astype(int) % 8
     expected = np.array([np.bincount(headings, seconds * one, 8) for one in torus[due].T])
     np.testing.assert_allclose(sums.heading, expected, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(sums.heading.sum(axis=0), sums.heading_seconds, rtol=1e-5)
+    np.testing.assert_allclose(sums.heading_seconds, np.bincount(headings, seconds, 8), rtol=1e-9)
     assert (sums.x_edges[0], sums.x_edges[-1]) == (np.nanmin(walk.truth[:, 0]), np.nanmax(walk.truth[:, 0]))
 
 
@@ -176,56 +198,41 @@ def test_an_interrupted_run_has_its_cells_and_a_continued_one_the_rest(result, w
     assert lost == pytest.approx(1 / RATE)
 
 
-def test_an_unfinished_run_has_rows_and_no_recording(walk, tmp_path):
-    config = LoopConfig.model_validate({**METHOD, "cells": CELLS})
-    with open_runner(config, walk, tmp_path / "run") as runner:
-        runner.process(list(walk)[:16])
-    assert (tmp_path / "run" / ROWS).exists()
-    assert not (tmp_path / "run" / "cells.npz").exists()
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"cells": {"chosen": 15_877}}, "cells.chosen: 15877; expected at most 15876"),
-        ({"cells": {"sums": {"bins": 500}}}, "cells.sums: sums of 15876 cells, which need 29.6 GiB"),
-    ],
-)
-def test_bad_settings_are_one_error_before_the_run_directory_is_made(walk, tmp_path, settings, message):
-    config = LoopConfig.model_validate({**METHOD, "cells": CELLS, **settings})
-    with pytest.raises(InputError, match=message), open_runner(config, walk, tmp_path / "run"):
-        pass
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_method_without_pose_cells_is_refused(walk):
+def test_bad_settings_are_one_error_before_the_run_directory_is_made(walk, tmp_path):
+    for cells, message in (
+        ({"chosen": 15_877}, "cells.chosen: 15877; expected at most 15876"),
+        (
+            {"sums": {"bins": 500}},
+            "cells.sums: sums of 15876 cells, which need 29.6 GiB; expected at most 2 ",
+        ),
+    ):
+        with pytest.raises(InputError, match=message), open_runner(config_of(cells), walk, tmp_path / "run"):
+            pass
+        assert not (tmp_path / "run").exists()
     backend = dead_reckoning.ENTRY.build(dead_reckoning.Config(), Sensors((1, 8, 1)), np.dtype(float))
     config = LoopConfig.model_validate({"backend": "dead_reckoning", "cells": {}})
     with pytest.raises(InputError, match="cells: `backend: dead_reckoning`, a method without pose cells"):
         plan_recording(config, walk, backend)
 
 
-def test_an_unknown_extent_is_an_error_and_a_given_one_is_used(walk, tmp_path):
+def test_the_extent_is_given_if_the_truth_is_unknown(walk, tmp_path):
+    """Then steps are recorded and not summed."""
     unknown = replace(walk, truth=None)
     with pytest.raises(InputError, match=r"cells.sums.extent: missing, and circles does not tell"):
-        session_of(unknown, CELLS)
+        build_session(config_of(CELLS), unknown)
     given = {**CELLS, "sums": {**CELLS["sums"], "extent": [0.0, 0.0, 0.5, 1.0]}}
-    sums = run(walk, tmp_path / "run", given).cells.sums
+    sums = run(walk, tmp_path / "known", given).cells.sums
     assert (sums.x_edges[-1], sums.y_edges[-1]) == (0.5, 1.0)
     inside = np.flatnonzero(walk.truth[:, 0] <= 0.5)
     assert sums.seconds.sum() == pytest.approx(5 / RATE * np.sum(inside % 5 == 4))
-
-
-def test_steps_of_an_unknown_pose_are_recorded_and_not_summed(walk, tmp_path):
-    sums = {**CELLS["sums"], "extent": [0.0, 0.0, 1.0, 1.0]}
-    cells = run(replace(walk, truth=None), tmp_path / "run", {**CELLS, "sums": sums}).cells
+    cells = run(unknown, tmp_path / "unknown", given).cells
     assert np.isnan(cells.truth).all()
     assert len(cells.activity) == STEPS
     assert cells.sums.seconds.sum() == cells.sums.place.sum() == 0
 
 
 def test_a_loop_of_ones_own_has_the_chosen_cells_of_each_step(result, walk):
-    slam = ratslam.Slam(LoopConfig.model_validate({**METHOD, "cells": CELLS}), walk)
+    slam = ratslam.Slam(config_of(CELLS), walk)
     assert slam.cells is None
     for sample, activity in zip(walk, result.cells.activity[:20], strict=False):
         slam.step(sample)

@@ -6,7 +6,7 @@ import json
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,12 @@ import pytest
 import ratslam
 import ratslam.runs.runner
 from ratslam.core.session import Session
+from ratslam.methods.map_file import digest_of
 from ratslam.runs.build_session import build_session
 from ratslam.runs.continuation import resume_session
 from ratslam.runs.run import process_source
 from ratslam.runs.runner import open_runner
-from ratslam.runs.saved_map import SavedMap, describe_readings, digest_of, read_map, write_map
+from ratslam.runs.saved_map import SavedMap, describe_readings, read_map, write_map
 from ratslam.runs.settings.run_config import LoopConfig
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
@@ -40,11 +41,12 @@ class Killed(Exception):
     """The end of a process, without results."""
 
 
+def interrupt() -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
 def kill() -> None:
     raise Killed
-
-
-interrupt = partial(signal.raise_signal, signal.SIGINT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +140,7 @@ def assert_same(found: SavedMap, expected: SavedMap) -> None:
     assert found.digest == expected.digest
 
 
-def test_an_interrupted_run_goes_on_after_its_own_samples(
-    monday: Path, expected: SavedMap, tmp_path: Path
-) -> None:
+def test_an_interrupted_run_goes_on_after_its_own_samples(monday, expected, tmp_path):
     """Twice: at a sample within a chunk of the session, and before the end."""
     parts = [run(stopping(30, interrupt), tmp_path / "a", monday)]
     parts.append(run(stopping(70, interrupt), tmp_path / "b", tmp_path / "a"))
@@ -152,9 +152,7 @@ def test_an_interrupted_run_goes_on_after_its_own_samples(
     np.testing.assert_array_equal(np.concatenate(times), second().time)
 
 
-def test_a_killed_run_goes_on_from_its_checkpoint(
-    monday: Path, expected: SavedMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_run_goes_on_from_its_checkpoint(monday, expected, tmp_path, monkeypatch):
     monkeypatch.setattr(ratslam.runs.runner, "CHECKPOINT_EVERY", 16)
     with pytest.raises(Killed):
         run(stopping(45, kill), tmp_path / "killed", monday)
@@ -176,19 +174,13 @@ def of_first_format(file: Path, path: Path) -> Path:
     return path
 
 
-def test_a_map_of_one_recording_in_the_first_format_goes_on(tmp_path: Path) -> None:
+def test_a_map_in_the_first_format_goes_on_if_it_tells_its_samples(expected, tmp_path):
     whole = run(second(), tmp_path / "whole")
     run(stopping(45, interrupt), tmp_path / "a")
-    old = of_first_format(tmp_path / "a" / "map.npz", tmp_path / "old.npz")
-    found = run(second(), tmp_path / "b", old)
+    found = run(second(), tmp_path / "b", of_first_format(tmp_path / "a" / "map.npz", tmp_path / "a.npz"))
     assert found.steps == whole.steps
     maps = [saved.open_session().map for saved in (found, whole)]
     np.testing.assert_array_equal(*(map.trajectory() for map in maps))
-
-
-def test_a_map_in_the_first_format_that_does_not_tell_its_samples_is_refused(
-    expected: SavedMap, tmp_path: Path
-) -> None:
     old = of_first_format(expected.path, tmp_path / "old.npz")
     message = r"old\.npz: 160 steps of several recordings.*continue the map that this one went on from"
     with pytest.raises(InputError, match=message):
@@ -196,23 +188,18 @@ def test_a_map_in_the_first_format_that_does_not_tell_its_samples_is_refused(
     assert run(part("wednesday", slice(160, 170)), tmp_path / "other", old).samples_of("wednesday") == 10
 
 
-@pytest.mark.parametrize("recording", ["tuesday", ""])
-def test_another_recording_cannot_go_on_in_a_map_of_one_piece(recording: str, tmp_path: Path) -> None:
+def test_a_map_of_one_piece_takes_no_other_recording_and_no_other_method(monday, tmp_path):
     config = LoopConfig.model_validate(METHOD | {"backend": "classic"})
     session, source = build_session(config, first()), describe_readings(first())
     write_map(tmp_path / "map.npz", session, config, source, recording="monday")
     assert resume_session(session, tmp_path, config, first())[0] == 0
-    message = (
-        rf"map\.npz: a map of `backend: classic`, which is one piece; {recording or 'loop'} is not the "
-        "recording that was mapped last.*expected that recording, which goes on.*by itself, or map both with"
-    )
-    other = replace(second(), name=recording or "loop", digest=recording)
-    with pytest.raises(InputError, match=message):
-        resume_session(session, tmp_path, config, other)
-    assert session.steps == session.earlier == 0
-
-
-def test_another_method_is_refused_before_its_pieces(monday: Path, tmp_path: Path) -> None:
-    config = LoopConfig.model_validate(METHOD | {"backend": "classic"})
+    for recording in ("tuesday", ""):
+        other = replace(second(), name=recording or "loop", digest=recording)
+        message = (
+            rf"map\.npz: a map of `backend: classic`, which is one piece; {other.name} is not the recording"
+        )
+        with pytest.raises(InputError, match=f"{message}.*by itself, or map both with"):
+            resume_session(session, tmp_path, config, other)
+        assert session.steps == session.earlier == 0
     with pytest.raises(InputError, match=r"backend is classic and was recall.*`--set backend=recall`"):
-        resume_session(build_session(config, first()), monday, config, second())
+        resume_session(session, monday, config, second())

@@ -1,60 +1,30 @@
-"""Other touch sensors map the maze of `whisker_maze` by configuration and plug-in alone."""
+"""Other touch sensors map the maze of `whisker_maze` by configuration and plug-in alone; a rat in a box."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from evaluation.metrics.metric import Quantity
+from ratslam.cli import main
+from ratslam.core.session import Session
 from ratslam.examples import taxel_array
-from ratslam.runs.build_session import open_source
+from ratslam.runs.build_session import build_session, open_observations, open_source, read_observations
 from ratslam.runs.run import run
-from ratslam.runs.settings.completion import complete
-from ratslam.runs.settings.packaged import PRESETS
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from robot.sources.source import SOURCES
 from robot.touch_source import TOUCH
+from tactile.base.errors import InputError
 from tests.helpers import tactile_arrays
 
-SESSION = """
-    motion: {jitter: {position: 0.005, yaw_deg: 1.5, speed: 0.05}}
-"""
-SHORT = """
-    maze: {columns: 3, rows: 3, loop: 8}
-    path: {circuits: CCC}
-pose_cells: {cells_xy: 11}
-attractor: {engine: dense}
-"""
-HEAD = """
-touch:
-  head:
-    whiskers: 5
-    rings:
-      - {length: 0.05, radius: 0.045, height: 0.082}
-      - {length: 0.08, radius: 0.055, height: 0.10}
-      - {length: 0.11, radius: 0.065, height: 0.12}
-      - {length: 0.16, radius: 0.08, height: 0.165}
-simulation:
-"""
-TAXELS = """
-touch: {frontend: {plugin: taxels}}
-source:
-  plugin: taxels
-  settings:
-   simulation:
-"""
-WRENCH = """
-touch: {frontend: {plugin: wrench}}
-source:
-  plugin: wrench
-  settings:
-   simulation:
-"""
-LIMIT = {"head of 4 x 5": 0.1, "3 x 22 taxels": 0.1, "wrench of 1 x 6": 0.7}
+TAXELS, WRENCH = "3 x 22 taxels", "wrench of 1 x 6"
+NOISY = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}}}
+SHORT = {"maze": {"columns": 3, "rows": 3, "loop": 8}, "path": {"circuits": "CCC"}}
+LIMIT = {TAXELS: 0.1, WRENCH: 0.7}
 """Largest share of the odometry's Energy Metric after ten circuits."""
-SENSORS = {"head of 4 x 5": HEAD, "3 x 22 taxels": TAXELS, "wrench of 1 x 6": WRENCH}
 
 
 @pytest.fixture(autouse=True)
@@ -69,58 +39,92 @@ def plugins() -> Iterator[None]:
             registry.unregister(name)
 
 
-def scores(folder: Path, text: str, *settings: str) -> dict[str, Quantity]:
-    """The scorecard of a configuration."""
-    file = folder / "own.yaml"
-    file.write_text(text, encoding="utf-8")
-    return run(load_config(file, settings), folder / "run")[0].quantities
-
-
-def improvement(found: dict[str, Quantity]) -> float:
-    """The Energy Metric of all pairs over that of odometry."""
-    metric = found["energy_all"]
+def improvement(folder: Path, sensor: str, simulation: dict[str, Any]) -> float:
+    """The Energy Metric of all pairs over that of odometry, after a run in a simulated maze."""
+    plugin = "taxels" if sensor == TAXELS else "wrench"
+    parts: dict[str, Any] = {
+        "pose_cells": {"cells_xy": 11} if "maze" in simulation else {},
+        "touch": {"frontend": {"plugin": plugin}},
+        "source": {"plugin": plugin, "settings": {"simulation": NOISY | simulation}},
+    }
+    metric = run(RunConfig.model_validate(parts), folder / "run")[0].quantities["energy_all"]
+    print(sensor, simulation, metric)
     assert metric.value is not None
     assert metric.odometry is not None
     return metric.value / metric.odometry
 
 
-@pytest.mark.parametrize(
-    "sensor",
-    [
-        "wrench of 1 x 6",
-        *(pytest.param(sensor, marks=pytest.mark.soak) for sensor in SENSORS if "1 x" not in sensor),
-    ],
-)
+@pytest.mark.parametrize("sensor", [pytest.param(TAXELS, marks=pytest.mark.soak), WRENCH])
 def test_it_maps_three_circuits(sensor: str, tmp_path: Path) -> None:
-    found = scores(tmp_path, SENSORS[sensor] + SESSION + SHORT)
-    print(sensor, found["energy_all"], found["ate_final"], found["map_doubt"])
-    assert improvement(found) < 0.3
-
-
-@pytest.mark.parametrize("sensor", [pytest.param("3 x 22 taxels", marks=pytest.mark.soak), "wrench of 1 x 6"])
-def test_where_its_signal_is_lost_in_noise_odometry_remains(sensor: str, tmp_path: Path) -> None:
-    found = scores(tmp_path, SENSORS[sensor] + SESSION + SHORT, "source.settings.noise=0.5")
-    assert improvement(found) == pytest.approx(1.0, abs=0.05)
-
-
-def test_touch_without_whiskers_has_the_preset_for_touch_and_no_layout() -> None:
-    config = RunConfig.model_validate(
-        {"source": {"plugin": "wrench", "settings": {"simulation": {"path": {"circuits": "C"}}}},
-         "touch": {"frontend": {"plugin": "wrench"}}}
-    )  # fmt: skip
-    completed = complete(config, open_source(config))
-    assert completed.presets == ("touch",)
-    assert completed.recall.sector_fov == "none"
-    assert completed.keyframes.noise.per_cell == PRESETS["touch"]["keyframes"]["noise"]["per_cell"]
-    assert complete(completed, open_source(config)) == completed
+    assert improvement(tmp_path, sensor, SHORT) < 0.3
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("sensor", LIMIT)
 def test_it_maps_ten_circuits(sensor: str, seed: int, tmp_path: Path) -> None:
-    key = "simulation.seed" if sensor.startswith("head") else "source.settings.simulation.seed"
-    found = scores(tmp_path, SENSORS[sensor] + SESSION, f"{key}={seed}")
-    print(sensor, seed, found["energy_all"], found["ate_final"], found["map_doubt"])
-    assert improvement(found) < LIMIT[sensor]
+    assert improvement(tmp_path, sensor, {"seed": seed}) < LIMIT[sensor]
+
+
+RAT = ("rat_simulation.seconds=4", "session.reserve=64")
+PHASES = ("rat_darkness", "rat_cue_rotation", "rat_cue_conflict", "rat_kidnap", "rat_stretch")
+
+
+def shortened(name: str) -> RunConfig:
+    """A packaged session with all times divided by 20."""
+    config = load_config(name)
+    rat = config.rat_simulation
+    assert rat is not None
+    phases = [
+        phase.model_copy(update={"start": phase.start / 20, "end": phase.end and phase.end / 20})
+        for phase in rat.phases
+    ]
+    assert rat.seconds is not None
+    rat = rat.model_copy(update={"phases": tuple(phases), "seconds": rat.seconds / 20})
+    return config.model_copy(update={"rat_simulation": rat})
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    """One session for all of them, so that its kernel is compiled once."""
+    with open_observations(shortened("rat_box")) as opened:
+        return build_session(*opened)
+
+
+@pytest.mark.parametrize("name", PHASES)
+def test_a_packaged_session_runs(name: str, session: Session) -> None:
+    with open_observations(shortened(name)) as (config, source):
+        observations = [observation for _, observation in read_observations(source)]
+    assert (config.backend, config.presets) == ("classic", ())
+    session.restart()
+    estimates = [step.estimate for step in session.replay(observations)]
+    assert len(estimates) == source.length == 120
+    assert all(np.isfinite(estimate.pose).all() and not estimate.lost for estimate in estimates)
+
+
+def test_a_recording_of_a_session_has_its_readings(tmp_path: Path) -> None:
+    file = tmp_path / "rat.mcap"
+    sets = [argument for setting in RAT for argument in ("--set", setting)]
+    assert main(["simulate", "rat_box", "-o", str(file), *sets]) == 0
+    (tmp_path / "again.yaml").write_text("recording: {file: rat.mcap}\n")
+    made, read = open_source(load_config("rat_box", RAT)), open_source(tmp_path / "again.yaml")
+    assert read.info.box == made.info.box
+    for ours, theirs in zip(made, read, strict=True):
+        np.testing.assert_allclose(theirs.reading.view, ours.reading.view, atol=1e-6)
+        np.testing.assert_allclose(theirs.reading.odometry, ours.reading.odometry)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("path.file=none.npz", "none.npz: no such file"),
+        ("box.width=0", "rat_simulation.box.width"),
+        ("phases=[{start: 900, dark: true}]", "rat_simulation.phases.0.start: 900 s"),
+        ("path.max_speed=0.1", "sargolini.npz:"),
+    ],
+)
+def test_a_wrong_setting_of_the_rat_is_one_error(setting: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        open_source(load_config("rat_box", [f"rat_simulation.{setting}"]))
+    assert "\n" not in str(caught.value)

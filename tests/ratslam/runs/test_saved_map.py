@@ -1,39 +1,63 @@
-"""Map files: one format for runs and loops; refusals of what is broken or of another sensor."""
+"""Map files: one format for runs and loops; refusals of what is spoilt, no map, or of another sensor."""
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
+import subprocess
+import sys
 import zipfile
+from functools import cache
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ratslam
+from ratslam.core.backend import PathMap
 from ratslam.core.session import Session
-from ratslam.runs.saved_map import FORMAT, digest_of, read_map, write_map
-from ratslam.runs.settings.strict_yaml import dump, dump_data, parse
+from ratslam.methods.config import LocaliseConfig
+from ratslam.methods.map_file import FORMAT, digest_of, restore_map
+from ratslam.methods.method_registry import LOCALISING
+from ratslam.runs.localise import localising, recorded_alike
+from ratslam.runs.map_care import map_info, undo_sequence
+from ratslam.runs.saved_map import SavedMap, read_map, write_map
+from ratslam.runs.settings.run_config import LoopConfig, RunConfig
+from robot.recordings.formats import open_recording
+from robot.recordings.recording_config import RecordingConfig
+from robot.sources.source import SourceDescription
 from tactile.base.errors import InputError
 
-CONFIG = """
-pose_cells: {cells_xy: 15, cells_heading: 12, cell_size: 0.1}
-attractor: {engine: dense}
-recording: {file: %s}
-"""
-ROOT = Path(__file__).parents[3]
-TRACE = ROOT / "tests" / "golden" / "j_reverse_stop.npz"
+TESTS = Path(__file__).parents[2]
+FILE = TESTS / "data" / "maps" / f"{FORMAT}.npz"
+CONFIG = {
+    "pose_cells": {"cells_xy": 15, "cells_heading": 12, "cell_size": 0.1},
+    "attractor": {"engine": "dense"},
+    "recording": {"file": TESTS / "golden" / "j_reverse_stop.npz"},
+}
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> ratslam.Result:
-    folder = tmp_path_factory.mktemp("saved")
-    (folder / "session.yaml").write_text(CONFIG % TRACE)
-    return ratslam.run(folder / "session.yaml", folder / "run")
+    return ratslam.run(RunConfig.model_validate(CONFIG), tmp_path_factory.mktemp("saved") / "run")
 
 
 @pytest.fixture(scope="module")
 def session(run: ratslam.Result) -> Session:
     """A session with the configuration of the run."""
     return read_map(run.directory).open_session()
+
+
+def packed(arrays: dict[str, np.ndarray]) -> bytes:
+    np.savez_compressed(file := BytesIO(), **arrays)
+    return file.getvalue()
+
+
+def signed(arrays: dict[str, np.ndarray]) -> bytes:
+    """A file whose digest is right, as of a program that writes maps wrongly."""
+    return packed(arrays | {"sha256": np.array(digest_of(arrays))})
 
 
 def rewritten(
@@ -43,10 +67,7 @@ def rewritten(
     with np.load(file) as archive:
         arrays = {name: archive[name] for name in archive.files if name not in drop}
     arrays |= {name.replace("__", "/"): np.asarray(value) for name, value in changes.items()}
-    if sign and "sha256" in arrays:
-        arrays["sha256"] = np.array(digest_of(arrays))
-    with path.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
+    path.write_bytes(signed(arrays) if sign else packed(arrays))
     return path
 
 
@@ -63,8 +84,7 @@ def test_a_loop_goes_on_from_a_run_and_a_run_from_a_loop(run: ratslam.Result, tm
     slam = ratslam.Slam.load(run.directory)
     slam.save(tmp_path / "again.npz")
     before, after = read_map(run.directory), read_map(tmp_path / "again.npz")
-    assert after.config == before.config
-    assert after.source == before.source
+    assert (after.config, after.source) == (before.config, before.source)
     for name, array in before.arrays.items():
         np.testing.assert_array_equal(array, after.arrays[name])
     with ratslam.open_source(before.config) as source:
@@ -83,24 +103,10 @@ def test_written_maps_are_equal_to_the_bit(run: ratslam.Result, session: Session
     assert (tmp_path / "map.npz").read_bytes() == (run.directory / "map.npz").read_bytes()
 
 
-def test_a_map_whose_settings_have_moved_since_is_opened(run: ratslam.Result, tmp_path: Path) -> None:
-    new = read_map(run.directory)
-    settings = parse(dump(new.config), "config").data
-    settings["pose_cells"] |= settings.pop("attractor")
-    saved = read_map(rewritten(run.directory / "map.npz", tmp_path / "map.npz", config=dump_data(settings)))
-    assert saved.config == new.config
-    restored = saved.open_session().arrays()
-    for name, array in new.arrays.items():
-        np.testing.assert_array_equal(restored[name], array)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"format": "ratslam-map-9"},
-            "map format 'ratslam-map-9'.*expected ratslam-map-1 or ratslam-map-2 or ratslam-map-3.*update",
-        ),
+        ({"format": "ratslam-map-9"}, "format 'ratslam-map-9'.*ratslam-map-1 or .* or ratslam-map-3"),
         ({"format": 3}, "map format '3'"),
         ({"config": "backend: nemo\n"}, "backend: 'nemo'; expected a backend"),
         ({"config": "recall: {guard: many}\n"}, "config:1:"),
@@ -123,18 +129,83 @@ def test_broken_files_are_refused(run: ratslam.Result, tmp_path: Path, changes: 
         read_map(rewritten(run.directory / "map.npz", tmp_path / "map.npz", **changes))
 
 
-def test_other_files_are_refused(tmp_path: Path) -> None:
+def refusal(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        read_map(path)
+    said = str(caught.value)
+    assert said.startswith(f"{path}: ")
+    return said.removeprefix(f"{path}: ")
+
+
+def test_a_damaged_map_is_told_from_another_file(tmp_path: Path) -> None:
+    path, whole = tmp_path / "map.npz", FILE.read_bytes()
+    middle = len(whole) // 2
+    for content in (whole[:middle], whole[:-1], whole[:middle] + bytes(8) + whole[middle + 8 :]):
+        path.write_bytes(content)
+        said = refusal(path)
+        assert said.startswith("damaged")
+        assert "restore it from a copy" in said
+    path.write_bytes(b"t,x,y\n")
+    assert refusal(path).startswith("not a map; expected a map")
+    path.write_bytes(b"")
+    assert refusal(path).startswith("empty")
+
+
+def test_a_map_that_cannot_be_opened_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "pipe.npz")
+    assert refusal(tmp_path / "pipe.npz").startswith("neither a file nor a folder; expected a map")
+    assert refusal(FILE / "map.npz").startswith("cannot be read (Not a directory); ")
     with pytest.raises(InputError, match=r"map\.npz: no such file; expected a map"):
         read_map(tmp_path)
-    (tmp_path / "map.npz").write_bytes(b"")
-    with pytest.raises(InputError, match="not a map"):
-        read_map(tmp_path)
-    with zipfile.ZipFile(tmp_path / "bomb.npz", "w") as archive:
-        archive.writestr("steps.npy", b"\x93NUMPY\x01\x00")
-        archive.writestr("format.npy", b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, "
-                         + b"'shape': (1099511627776,), }".ljust(80) + b"\n")  # fmt: skip
-    with pytest.raises(InputError, match="not a map"):
-        read_map(tmp_path / "bomb.npz")
+    with pytest.raises(InputError, match=f"^{tmp_path / 'map.npz'}: no such file; expected the map in which"):
+        restore_map(LocaliseConfig(map=tmp_path), PathMap(), "recall")
+
+    def deny(path: Path, *_: object, **__: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(Path, "open", deny)
+    said = refusal(FILE)
+    assert said.startswith("cannot be read (Permission denied); ")
+    assert "permissions" in said
+
+
+@pytest.mark.soak
+def test_a_localised_session_names_its_map_that_was_changed_or_moved(tmp_path: Path) -> None:
+    place, session = Path(shutil.copy(FILE, tmp_path / "place.npz")), tmp_path / "session.npz"
+    slam = ratslam.Slam.load(place, "localise")
+    with open_recording(RecordingConfig(file=TESTS / "golden" / "touch_circuits.mcap")) as recording:
+        for sample, _ in zip(recording, range(5), strict=False):
+            slam.step(sample.reading)
+    slam.save(session)
+    assert map_info(read_map(session))["steps"] == 5
+    saved = read_map(place)
+    undo_sequence(saved, map_info(saved)["accepted_sequences"][0]["sequence"], place)
+    with pytest.raises(InputError, match=f"expected {place} as it was when this session was localised"):
+        read_map(session).open_session()
+    place.unlink()
+    with pytest.raises(InputError, match=f"{place}: no such file; expected the map in which"):
+        read_map(session).open_session()
+
+
+def test_a_map_in_the_place_of_a_recording_is_one_error(tmp_path: Path) -> None:
+    shutil.copy(FILE, tmp_path / "map.npz")
+    for path in (FILE, tmp_path):
+        with pytest.raises(InputError, match="a map, which is no recording") as caught:
+            recorded_alike(path, read_map(FILE))
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("backend", ["localise_grid", "classic", *LOCALISING])
+def test_a_robot_is_found_in_maps_of_some_methods_and_others_are_refused_with_the_cure(backend: str) -> None:
+    config = LoopConfig.model_validate({"backend": backend})
+    saved = SavedMap(Path("map.npz"), FORMAT, "", config, SourceDescription((1, 36, 1), 0, 10.0), "", {})
+    if backend in LOCALISING:
+        assert localising(saved.config, saved).backend == LOCALISING[backend]
+        return
+    reason = {"localise_grid": "a session in another map", "classic": "classic"}[backend]
+    with pytest.raises(InputError, match=reason) as error:
+        localising(saved.config, saved)
+    assert "map the place again with `backend: recall`" in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -155,14 +226,11 @@ def test_other_sensors_are_refused(run: ratslam.Result, changes: dict, message: 
 
 
 def test_other_settings_of_a_sensor_are_named_with_those_of_the_map(run: ratslam.Result) -> None:
-    sensor = read_map(run.directory).sensor
-    views = "recording.topics.views"
-    of_map = sensor._replace(
-        transform={f"{views}.max_range": None, f"{views}.columns": 6, "templates.patch": 0}
-    )
-    other = of_map._replace(
-        transform={f"{views}.max_range": 5.0, f"{views}.columns": 4}, view_shape=(3, 4, 1), cell=0.2
-    )
+    views, sensor = "recording.topics.views", read_map(run.directory).sensor
+    ours = {f"{views}.max_range": None, f"{views}.columns": 6, "templates.patch": 0}
+    theirs = {f"{views}.max_range": 5.0, f"{views}.columns": 4}
+    of_map = sensor._replace(transform=ours)
+    other = of_map._replace(transform=theirs, view_shape=(3, 4, 1), cell=0.2)
     with pytest.raises(InputError, match="made with other settings of the sensor: ") as caught:
         of_map.check_same("map.npz", other)
     cure = f"`--set {views}.max_range=null --set {views}.columns=6 --set pose_cells.cell_size=0.1`"
@@ -180,9 +248,120 @@ def test_other_settings_of_a_sensor_are_named_with_those_of_the_map(run: ratslam
         ({"map__graph__more": np.zeros(3)}, "the unknown array map/graph/more"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(
-    run: ratslam.Result, session: Session, tmp_path: Path, changes: dict, message: str
-) -> None:
+def test_arrays_that_do_not_fit_are_refused(run, session, tmp_path, changes, message):
     saved = read_map(rewritten(run.directory / "map.npz", tmp_path / "map.npz", **changes))
     with pytest.raises(InputError, match=message):
         saved.restore(session, saved.config)
+
+
+@cache
+def content() -> tuple[bytes, dict[str, np.ndarray]]:
+    """The bytes and the arrays of a whole map file."""
+    with np.load(FILE) as archive:
+        return FILE.read_bytes(), {name: archive[name] for name in archive.files}
+
+
+KINDS = ("bit", "bytes", "cut", "left out", "type", "shape", "version", "bomb", "nothing")
+
+
+def spoilt(kind: str, stream: np.random.Generator) -> bytes:
+    """A spoilt copy: bits are wrong, a part of the file or an array is lost or another one, or the file says
+    that it holds more than any memory. Bits that NumPy does not read, such as times, change nothing."""
+    whole, arrays = bytearray(content()[0]), dict(content()[1])
+    names = [name for name in sorted(arrays) if not name.startswith("frontend/")]
+    name = names[stream.integers(len(names))]
+    array = arrays[name]
+    match kind:
+        case "bit":
+            whole[stream.integers(len(whole))] ^= 1 << int(stream.integers(8))
+        case "bytes":
+            for at in stream.integers(len(whole), size=64):
+                whole[at] = int(stream.integers(256))
+        case "cut":
+            return bytes(whole[: stream.integers(len(whole))])
+        case "left out":
+            del arrays[name]
+            return signed(arrays) if name != "sha256" else packed(arrays)
+        case "type":
+            return signed(arrays | {name: np.zeros(array.shape, "U3" if array.dtype.kind != "U" else "f8")})
+        case "shape":
+            return signed(arrays | {name: np.stack([array, array])[..., None]})
+        case "version":
+            version = f"ratslam-map-{stream.integers(4, 99)}" if stream.random() < 0.5 else "\0" * 9
+            return signed(arrays | {"format": np.array(version)})
+        case "bomb":
+            file, shape = BytesIO(packed(arrays)), 1 << int(stream.integers(41, 60))
+            head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({shape},), }}".ljust(117) + "\n"
+            array_file = b"\x93NUMPY\x01\x00v\x00" + head.encode() + bytes(1 << 20)
+            with zipfile.ZipFile(file, "a", zipfile.ZIP_DEFLATED) as archive:
+                archive.writestr(f"more{name}.npy", array_file)
+            return file.getvalue()
+        case "nothing":
+            return b"" if stream.random() < 0.5 else bytes(stream.integers(256, size=200, dtype=np.uint8))
+    return bytes(whole)
+
+
+@pytest.mark.parametrize("count", [24, pytest.param(200, marks=pytest.mark.soak)])
+def test_spoilt_files_are_refused(count: int, tmp_path: Path) -> None:
+    session = read_map(FILE).open_session()
+
+    def refused(path: Path) -> str:
+        """The error of opening a map; '' if it opens."""
+        try:
+            saved = read_map(path)
+            saved.restore(session, saved.config)
+        except InputError as error:
+            return str(error)
+        return ""
+
+    assert refused(FILE) == ""
+    for seed in range(count):
+        stream, kind = np.random.default_rng([23, seed]), KINDS[seed % len(KINDS)]
+        path = tmp_path / f"{seed}.npz"
+        path.write_bytes(spoilt(kind, stream))
+        said = refused(path)
+        if not said and kind == "bit":
+            assert read_map(path).digest == read_map(FILE).digest, seed  # a byte that says nothing
+            continue
+        assert said.startswith(str(path)), (seed, kind, said)
+        assert len(said) < 400 + len(str(path)), (seed, kind, said)
+        path.unlink()
+
+
+WRITER = """
+import sys
+from pathlib import Path
+import numpy as np
+from ratslam.runs.saved_map import read_map, write_map
+
+saved = read_map(Path(sys.argv[1]))
+
+class Session:
+    def arrays(self):
+        return dict(saved.arrays) | {"state/more": noise}
+
+noise = np.zeros(0)
+while True:
+    write_map(Path(sys.argv[2]), Session(), saved.config, saved.source)
+    print(len(noise), flush=True)
+    noise = np.random.default_rng(0).normal(size=(len(noise) + 200_000) % 1_000_000)
+"""
+
+
+@pytest.mark.parametrize("kills", [1, pytest.param(20, marks=pytest.mark.soak)])
+def test_a_killed_writer_leaves_a_whole_file(kills: int, tmp_path: Path) -> None:
+    """Maps of 0 to 6 MB are written over each other until the process is killed, at different times."""
+    path = tmp_path / "map.npz"
+    for delay in np.linspace(0.5, 0.0, kills):
+        command = [sys.executable, "-c", WRITER, str(FILE), str(path)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        process.stdout.readline()
+        try:
+            process.wait(timeout=delay)
+        except subprocess.TimeoutExpired:
+            process.kill()
+        process.communicate()
+        saved = read_map(path)
+        assert saved.steps == read_map(FILE).steps
+        assert len(saved.arrays["state/more"]) % 200_000 == 0

@@ -1,10 +1,14 @@
-"""One's own loop: the bits of a run, checkpoints, readings of every kind, refusals."""
+"""The program as functions: one's own loop with the bits of a run, and the result of a run."""
 
 from __future__ import annotations
 
 import csv
+import re
+import threading
+from base64 import b64encode
+from html import unescape
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -17,30 +21,24 @@ from robot.simulation.head.simulated_session import HeadSimulation, SimulationCo
 from tactile.base.types import MotionKind, Report, Whisk
 
 ROOT = Path(__file__).parents[3]
+NO_SOURCE = "backend: classic\npose_cells: {cells_xy: 15, cells_heading: 12}\nattractor: {engine: dense}\n"
 SESSIONS = {
     "a recording": f"""
 recording: {{file: {ROOT}/tests/golden/j_reverse_stop.npz}}
 pose_cells: {{cells_xy: 15, cells_heading: 12, cell_size: 0.1}}
 attractor: {{engine: dense}}
 """,
-    "a Create": """
-create_simulation: {reports: 60}
-backend: classic
-pose_cells: {cells_xy: 15, cells_heading: 12}
-attractor: {engine: dense}
-touch: {reports: {fold_back: true, walls: geometric}}
+    "a Create": f"""
+create_simulation: {{reports: 60}}
+{NO_SOURCE}
+touch: {{reports: {{fold_back: true, walls: geometric}}}}
 """,
 }
-NO_SOURCE = "backend: classic\npose_cells: {cells_xy: 15, cells_heading: 12}\nattractor: {engine: dense}\n"
 FORWARD = ratslam.Odometry(0.1, 0.0, 0.0, 1.0)
 
 
 class Walk(NamedTuple):
-    """A configuration, its run, and a loop over the samples of its source.
-
-    Attributes:
-        estimates: after each sample. saved: checkpoint after some of the samples, by number.
-    """
+    """A run, a loop with an estimate after each sample of the same source, and checkpoints after some."""
 
     config: Path
     run: ratslam.Result
@@ -49,17 +47,23 @@ class Walk(NamedTuple):
     estimates: list[ratslam.PoseEstimate]
     saved: dict[int, Path]
 
+    def kept(self) -> list[ratslam.PoseEstimate]:
+        """Those not repeated after a reading that the front end adds to the next one."""
+        pairs = zip(self.estimates, [None, *self.estimates], strict=False)
+        return [estimate for estimate, before in pairs if estimate is not before]
+
 
 @pytest.fixture(scope="module", params=SESSIONS)
 def walk(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Walk:
     folder = tmp_path_factory.mktemp("walk")
     config = folder / "session.yaml"
     config.write_text(SESSIONS[request.param])
-    run = ratslam.run(config, folder / "run")
-    slam = ratslam.Slam(config)
+    run, slam = ratslam.run(config, folder / "run"), ratslam.Slam(config)
     with ratslam.open_source(config) as source:
         samples = list(source)
-    backwards = [number for number, sample in enumerate(samples) if is_back(sample)]
+    # The touch front end remembers the motion of a report that goes back for the next one.
+    reports = [sample.reading for sample in samples if isinstance(sample.reading, Report)]
+    backwards = [number for number, one in enumerate(reports) if one.motion == MotionKind.BACK]
     saved = {number: folder / "not yet made" / str(number) for number in (len(samples) // 2, *backwards[-1:])}
     estimates = []
     for number, sample in enumerate(samples):
@@ -70,23 +74,11 @@ def walk(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return Walk(config, run, slam, samples, estimates, saved)
 
 
-def is_back(sample: ratslam.Sample) -> bool:
-    """Whether the touch front end remembers the motion of this reading for the next one."""
-    return isinstance(sample.reading, Report) and sample.reading.motion == MotionKind.BACK
-
-
-def new_estimates(walk: Walk) -> list[ratslam.PoseEstimate]:
-    """The estimates without those repeated after a reading that the front end adds to the next one."""
-    pairs = zip(walk.estimates, [None, *walk.estimates], strict=False)
-    return [estimate for estimate, before in pairs if estimate is not before]
-
-
 def test_steps_are_those_of_a_run(walk: Walk) -> None:
     with (walk.run.directory / "steps.csv").open() as lines:
         rows = list(csv.DictReader(lines))
-    kept = new_estimates(walk)
-    assert len(rows) == len(kept) == walk.slam.steps
-    for row, estimate in zip(rows, kept, strict=True):
+    assert len(rows) == len(walk.kept()) == walk.slam.steps
+    for row, estimate in zip(rows, walk.kept(), strict=True):
         assert [float(row[name]) for name in ("x", "y", "heading")] == estimate.pose.tolist()
         assert (int(row["place"]), row["outcome"]) == (estimate.place, estimate.outcome)
         assert bool(int(row["lost"])) == estimate.lost
@@ -99,16 +91,11 @@ def test_steps_are_those_of_a_run(walk: Walk) -> None:
 def test_a_checkpoint_continues_to_the_same_bits(walk: Walk) -> None:
     for number, path in walk.saved.items():
         slam = ratslam.Slam.load(path)
-        assert_equal(slam.estimate, walk.estimates[number])
+        np.testing.assert_equal(slam.estimate, walk.estimates[number])
         for sample, expected in zip(walk.samples[number + 1 :], walk.estimates[number + 1 :], strict=True):
-            assert_equal(slam.step(sample), expected)
+            np.testing.assert_equal(slam.step(sample), expected)
         np.testing.assert_array_equal(slam.trajectory(), walk.slam.trajectory())
-        assert slam.config == walk.slam.config
-        assert slam.source == walk.slam.source
-
-
-def assert_equal(found: ratslam.PoseEstimate, expected: ratslam.PoseEstimate) -> None:
-    np.testing.assert_equal(found, expected)
+        assert (slam.config, slam.source) == (walk.slam.config, walk.slam.source)
 
 
 def test_the_source_and_its_observations_give_the_same_steps(walk: Walk) -> None:
@@ -117,7 +104,7 @@ def test_the_source_and_its_observations_give_the_same_steps(walk: Walk) -> None
         for sample in list(source)[:20]:
             assert isinstance(sample.reading, ratslam.Observation)
             slam.step(sample.reading)
-    assert_equal(slam.estimate, new_estimates(walk)[19])
+    np.testing.assert_equal(slam.estimate, walk.kept()[19])
 
 
 def test_the_covariance_is_turned_to_the_map() -> None:
@@ -136,27 +123,20 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_without_a_source_info_is_required(own: Path) -> None:
+def test_a_source_is_given_once(own: Path, tmp_path: Path) -> None:
     with pytest.raises(ratslam.InputError, match=r"no source; .* `info` .*SourceDescription"):
         ratslam.Slam(own)
-
-
-def test_a_run_without_a_source_is_refused_as_before(own: Path) -> None:
-    message = (
-        "live: nothing: neither recording, simulation, create_simulation, rat_simulation, source nor live; "
-        "give one of these six"
-    )
-    with pytest.raises(ratslam.InputError, match=message):
-        ratslam.run(own)
-    with pytest.raises(ratslam.InputError, match=message):
-        ratslam.load_config(own)
-
-
-def test_two_sources_are_refused_in_a_loop_too(tmp_path: Path) -> None:
-    config = tmp_path / "two.yaml"
-    config.write_text("simulation: {}\ncreate_simulation: {}\n")
+    for action in (ratslam.run, ratslam.load_config):
+        with pytest.raises(ratslam.InputError, match="live: nothing: neither recording, simulation"):
+            action(own)
+    (tmp_path / "two.yaml").write_text("simulation: {}\ncreate_simulation: {}\n")
     with pytest.raises(ratslam.InputError, match="simulation and create_simulation; give one"):
-        ratslam.Slam(config, ratslam.SourceDescription((3, 6, 1)))
+        ratslam.Slam(tmp_path / "two.yaml", ratslam.SourceDescription((3, 6, 1)))
+    with pytest.raises(ratslam.InputError, match="info: a SourceInfo without whiskers"):
+        ratslam.Slam(own, ratslam.SourceInfo())
+    for shape in ((3, 6), (0, 6, 1)):
+        with pytest.raises(ratslam.InputError, match="view_shape: the view shape"):
+            ratslam.SourceDescription(shape)
 
 
 @pytest.fixture(scope="module")
@@ -174,25 +154,24 @@ def test_described_readings_are_mapped(camera: ratslam.Slam) -> None:
     assert len(camera.map.graph()) > 0
 
 
+def still(**given: Any) -> ratslam.Observation:
+    return ratslam.observation(FORWARD, **{"view_shape": (1, 8, 1)} | given)
+
+
 @pytest.mark.parametrize(
     ("reading", "message"),
     [
-        (ratslam.observation(FORWARD, np.zeros((1, 9, 1))), r"view: shape \(1, 9, 1\); expected \(1, 8, 1\)"),
-        (ratslam.observation(FORWARD, view_shape=(1, 8, 1), whiskers=4), r"contact: shape \(4,\)"),
+        (still(view_shape=(1, 9, 1)), r"view: shape \(1, 9, 1\); expected \(1, 8, 1\)"),
+        (still(whiskers=4), r"contact: shape \(4,\)"),
         (
-            ratslam.observation(FORWARD._replace(dx=np.nan), view_shape=(1, 8, 1)),
+            still()._replace(odometry=FORWARD._replace(dx=np.nan)),
             r"odometry\.dx: a number that is not finite",
         ),
-        (
-            ratslam.observation(FORWARD, view_shape=(1, 8, 1))._replace(label=np.float64(1.5)),
-            "label: numbers of type float64; expected int32",
-        ),
+        (still()._replace(label=np.float64(1.5)), "label: numbers of type float64; expected int32"),
         (Whisk(FORWARD, *[np.zeros(18)] * 6), "a Whisk; expected an Observation"),
     ],
 )
-def test_readings_that_do_not_fit_change_nothing(
-    camera: ratslam.Slam, reading: ratslam.Observation, message: str
-) -> None:
+def test_readings_that_do_not_fit_change_nothing(camera, reading, message):
     before, steps = camera.estimate, camera.steps
     with pytest.raises(ratslam.InputError, match=message):
         camera.step(reading)
@@ -205,36 +184,93 @@ def test_other_dtypes_are_converted(own: Path) -> None:
     exact, rough = (ratslam.Slam(own, ratslam.SourceDescription((1, 8, 1))) for _ in range(2))
     view = np.full((1, 8, 1), 0.5)
     given = ratslam.observation(ratslam.Odometry(0.25, 0.0, 0.0, 1.0), view)
-    short = given._replace(
-        view=np.float32(view), label=np.int64(-1), odometry=ratslam.Odometry(0.25, 0, 0, 1)
-    )
-    assert_equal(rough.step(short), exact.step(given))
+    odometry = ratslam.Odometry(0.25, 0, 0, 1)
+    short = given._replace(view=np.float32(view), label=np.int64(-1), odometry=odometry)
+    np.testing.assert_equal(rough.step(short), exact.step(given))
 
 
 def test_the_info_of_whiskers_is_enough(own: Path) -> None:
     source = HeadSimulation(SimulationConfig(path={"explore": 5}))
     slam = ratslam.Slam(own, source.info)
-    for sample in source:
-        estimate = slam.step(sample)
-    assert slam.source.view_shape == source.view_shape
-    assert slam.source.whiskers == source.whiskers
-    assert estimate.outcome == "ok"
+    assert {slam.step(sample).outcome for sample in source} == {"ok"}
+    assert (slam.source.view_shape, slam.source.whiskers) == (source.view_shape, source.whiskers)
 
 
-def test_the_info_of_a_camera_is_not_enough(own: Path) -> None:
-    with pytest.raises(ratslam.InputError, match="info: a SourceInfo without whiskers"):
-        ratslam.Slam(own, ratslam.SourceInfo())
+HOSTILE = "<script>alert(1)</script> & \"'"
 
 
-@pytest.mark.parametrize("shape", [(3, 6), (0, 6, 1)])
-def test_a_view_shape_that_cannot_be_is_refused(shape: tuple[int, int, int]) -> None:
-    with pytest.raises(ratslam.InputError, match="view_shape: the view shape"):
-        ratslam.SourceDescription(shape)
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("result") / "maze.yaml"
+    path.write_text(f"simulation: {{path: {{explore: 40}}}}\n{NO_SOURCE}")
+    return path
 
 
-def test_other_files_are_not_loaded(own: Path, tmp_path: Path) -> None:
-    with pytest.raises(ratslam.InputError, match="no such file; expected a map"):
-        ratslam.Slam.load(tmp_path / "none")
-    np.savez(tmp_path / "map.npz", steps=np.array(3))
-    with pytest.raises(ratslam.InputError, match="a file without 'format'"):
-        ratslam.Slam.load(tmp_path / "map.npz")
+@pytest.fixture(scope="module")
+def result(config: Path) -> ratslam.Result:
+    """A run whose name is HTML."""
+    return ratslam.run(config, config.parent / HOSTILE.replace("/", "\N{DIVISION SLASH}"))
+
+
+def test_a_result_has_the_parts_of_a_run(result: ratslam.Result) -> None:
+    assert len(result.time) == 40
+    for poses in (result.trajectory, result.odometry, result.truth):
+        assert poses.shape == (40, 3)
+        assert np.isfinite(poses).all()
+    assert np.abs(result.odometry - result.truth).max() > 0
+    assert len(result.graph) == result.scorecard.quantities["experiences"].value
+    assert {"x", "y", "heading"} <= set(result.graph.nodes[0])
+    assert np.isnan(result.health.doubt)
+    assert "no loop closure was accepted" in result.health.reason
+    assert (result.health.input, result.warnings, result.health.doubted) == ("clean", (), False)
+    assert not result.interrupted
+
+
+def test_a_directory_is_opened_again_and_others_are_refused(result: ratslam.Result, tmp_path: Path) -> None:
+    again = ratslam.Result(result.directory)
+    np.testing.assert_array_equal(again.trajectory, result.trajectory)
+    assert again.scorecard == result.scorecard
+    with pytest.raises(ratslam.InputError, match="no such file; expected the directory of a scored run"):
+        ratslam.Result(tmp_path)
+
+
+def test_a_result_names_its_plots_and_says_how_good_it_is(result: ratslam.Result) -> None:
+    for name in ("map", "whiskers", "experiences"):
+        assert len(result.plot(name).axes) > 0
+    with pytest.raises(ratslam.InputError, match="plot: 'grid'; expected one of map, whiskers, experiences"):
+        result.plot("grid")
+    assert re.search(r"40 steps.*position error 0\.\d+ m \(odometry 0\.\d+\)", repr(result))
+
+
+def test_the_page_shows_map_and_scorecard_and_escapes_texts(result: ratslam.Result) -> None:
+    page = result._repr_html_()
+    picture = (result.directory / "map.png").read_bytes()
+    assert page.startswith(f'<div><img src="data:image/png;base64,{b64encode(picture).decode()}"')
+    assert set(re.findall(r"<(\w+)", page)) == {"div", "img", "p", "table", "tr", "th", "td"}
+    rows = [re.findall(r"<t[hd][^>]*>([^<]*)<", row) for row in page.split("<tr")[1:]]
+    shown = [[unescape(cell) for cell in row] for row in rows]
+    expected = [list(line) for lines in result.scorecard.lines().values() for line in lines]
+    assert [row for row in shown if row in expected] == expected
+    assert shown[0][0] == result.scorecard.name
+    assert shown[0][0].startswith("<script>")
+    assert "<p>This map is the odometry" in page
+
+
+def test_a_result_writes_its_report(result: ratslam.Result, tmp_path: Path) -> None:
+    page = result.report(tmp_path / "page.html")
+    assert page == tmp_path / "page.html"
+    assert HOSTILE.replace("<", "&lt;").partition(">")[0] in page.read_text(encoding="utf-8")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_runs_get_new_directories(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in a thread, where Ctrl-C cannot be caught."""
+    monkeypatch.chdir(tmp_path)
+    short = ratslam.load_config(config, ["simulation.path.explore=3"])
+    (tmp_path / "runs" / "run").mkdir(parents=True)
+    thread = threading.Thread(target=ratslam.run, args=(short,))
+    thread.start()
+    thread.join()
+    assert (tmp_path / "runs" / "run-2" / "map.png").exists()
+    with pytest.raises(ratslam.InputError, match="exists already"):
+        ratslam.run(short, tmp_path / "runs" / "run-2")

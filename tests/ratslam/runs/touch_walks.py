@@ -26,10 +26,6 @@ REACH = 0.1
 """Distance within which a closure is true, m: two pose cells."""
 
 
-CELLS = {"pose_cells": {"cells_xy": 11}}
-"""Few pose cells."""
-
-
 class Walk(NamedTuple):
     """Observations [N] and true poses [N, 3]."""
 
@@ -38,18 +34,17 @@ class Walk(NamedTuple):
 
 
 class MappedWalk(NamedTuple):
-    """The result of mapping a walk."""
+    """A mapped walk: its trajectory, its closures, and the steps before which the odometry is cut."""
 
     path: np.ndarray
     closures: np.ndarray
     cuts: list[int]
-    """Steps before which the odometry is cut."""
 
 
 def config_of(**parts: Any) -> RunConfig:
     """A small session: few pose cells, and room for all of it from the start, so that it compiles once."""
     session = {"reserve": 512} | parts.pop("session", {})
-    return RunConfig.model_validate({**CELLS, "session": session, **parts})
+    return RunConfig.model_validate({"pose_cells": {"cells_xy": 11}, "session": session, **parts})
 
 
 @cache
@@ -62,25 +57,21 @@ def _compiled(reserve: int, **keyframes: Any) -> tuple[Session, dict[str, np.nda
     return session, session.arrays()
 
 
-def empty_session(reserve: int = 512) -> Session:
+def empty_session(reserve: int = 512, **keyframes: Any) -> Session:
     """The shared compiled session, empty: all mazes, heads and controls have the same kernel."""
-    session, empty = _compiled(reserve)
+    session, empty = _compiled(reserve, **keyframes)
     session.restore(empty)
     return session
 
 
 def empty_carried_session() -> Session:
-    """The shared compiled session of a robot that may be carried, empty."""
-    session, empty = _compiled(512, may_be_carried=True)
-    session.restore(empty)
-    return session
+    """That of a robot that may be carried."""
+    return empty_session(may_be_carried=True)
 
 
 def empty_merging_session(merge_stood: int, **keyframes: Any) -> Session:
-    """The shared compiled session that merges keyframes soon, empty; 0: none."""
-    session, empty = _compiled(512, select_every=30, merge_stood=merge_stood, merge_newest=60, **keyframes)
-    session.restore(empty)
-    return session
+    """One that merges keyframes soon; 0: none."""
+    return empty_session(select_every=30, merge_stood=merge_stood, merge_newest=60, **keyframes)
 
 
 def simulate_walk(seed: int, dead: Sequence[int] = (), **simulation: Any) -> Walk:
@@ -144,3 +135,9 @@ def shuffled(readings: list[Observation]) -> list[Observation]:
 
 def unseen(readings: list[Observation]) -> list[Observation]:
     return [one._replace(view_seen=np.bool_(False)) for one in readings]
+
+
+def same_arrays(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
+    """Whether the arrays of two sessions are the same to the bit."""
+    assert one.keys() == other.keys()
+    return all(np.array_equal(one[name], other[name], equal_nan=one[name].dtype.kind == "f") for name in one)

@@ -12,35 +12,23 @@ from ratslam.runs.settings.completion import EXTENT_FACTOR, EXTENT_MARGIN, compl
 from ratslam.runs.settings.packaged import PRESETS
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.runs.settings.strict_yaml import dump, parse, validate
-from robot.sources.source import Source
+from robot.sources.source import SOURCES
+from robot.touch_source import TOUCH
 from tactile.base.errors import InputError
+from tests.helpers import tactile_arrays
 
 ROOT = Path(__file__).parents[4]
 SQUARE = {"recording": {"file": str(ROOT / "tests" / "golden" / "a_square3.npz")}}
 ARM = {"simulation": {"path": {"explore": 5}}, "touch": {"head": {"dead": [4]}}}
 CREATE = {"create_simulation": {"reports": 5}}
-PARTS: dict[str, dict[str, Any]] = {
-    "square": SQUARE,
-    "arm": ARM,
-    "arm, classic": ARM | {"backend": "classic"},
-    "arm, grid": ARM | {"backend": "grid"},
-    "create": CREATE,
-    "create, grid": CREATE | {"backend": "grid"},
+CASES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    "square": (SQUARE, ()),
+    "arm": (ARM, ("touch",)),
+    "arm, classic": (ARM | {"backend": "classic"}, ("touch",)),
+    "arm, grid": (ARM | {"backend": "grid"}, ("arm",)),
+    "create": (CREATE, ("touch",)),
+    "create, grid": (CREATE | {"backend": "grid"}, ("create",)),
 }
-USED = {
-    "square": (),
-    "arm": ("touch",),
-    "arm, classic": ("touch",),
-    "arm, grid": ("arm",),
-    "create": ("touch",),
-    "create, grid": ("create",),
-}
-
-
-@pytest.fixture(scope="module", params=PARTS)
-def case(request) -> tuple[str, RunConfig, Source]:
-    config = RunConfig.model_validate(PARTS[request.param])
-    return request.param, config, open_source(config)
 
 
 def values(settings: dict[str, Any], config: Any) -> list[tuple[Any, Any]]:
@@ -52,49 +40,53 @@ def values(settings: dict[str, Any], config: Any) -> list[tuple[Any, Any]]:
     return pairs
 
 
-def test_the_presets_that_suit_the_source_are_used_and_named(case):
-    name, config, source = case
+@pytest.mark.parametrize("case", CASES)
+def test_the_presets_that_suit_the_source_are_used_and_named(case: str) -> None:
+    """The completed configuration and the file of it are complete: they stay the same if completed again."""
+    parts, used = CASES[case]
+    config = RunConfig.model_validate(parts)
+    source = open_source(config)
     completed = complete(config, source)
-    assert completed.presets == USED[name]
-    for preset in USED[name]:
-        pairs = values(PRESETS[preset], completed)
-        assert all(value == found for value, found in pairs)
-
-
-def test_completing_again_changes_nothing(case):
-    _, config, source = case
-    completed = complete(config, source)
+    assert completed.presets == used
+    for preset in used:
+        assert all(value == found for value, found in values(PRESETS[preset], completed))
     assert complete(completed, source) == completed
-
-
-def test_the_written_configuration_is_complete(case):
-    _, config, source = case
-    completed = complete(config, source)
     again = validate(parse(dump(completed), "config.yaml"), RunConfig)
-    assert again == completed
-    assert complete(again, source) == completed
+    assert complete(again, source) == again == completed
     assert dump(complete(again, source)) == dump(completed)
-
-
-def test_a_preset_that_is_named_gives_the_same(case):
-    name, config, source = case
-    named = RunConfig.model_validate(PARTS[name] | {"presets": USED[name]})
-    assert complete(named, source) == complete(config, source)
+    assert complete(RunConfig.model_validate(parts | {"presets": used}), source) == completed
 
 
 def test_settings_of_the_configuration_go_before_presets():
-    config = RunConfig.model_validate(ARM | {"pose_cells": {"cells_xy": 31}, "recall": {"enter": 0.4}})
-    completed = complete(config, open_source(config))
+    given = {
+        "pose_cells": {"cells_xy": 31}, "recall": {"enter": 0.4},
+        "keyframes": {"min_score": 7.0, "noise": {"per_cell": 0.5}},
+    }  # fmt: skip
+    config = RunConfig.model_validate(ARM | given)
+    completed, preset = complete(config, open_source(config)), PRESETS["touch"]["keyframes"]
     assert completed.pose_cells.cells_xy == 31
     assert completed.recall.enter == 0.4
-    assert completed.keyframes.select_every == PRESETS["touch"]["keyframes"]["select_every"]
+    keyframes = completed.keyframes
+    assert (keyframes.min_score, keyframes.noise.per_cell) == (7.0, 0.5)
+    assert keyframes.select_every == preset["select_every"]
+    assert keyframes.noise.heading_per_cell == preset["noise"]["heading_per_cell"]
 
 
-def test_no_preset_is_used_if_the_list_is_empty_or_views_are_not_of_whiskers():
-    for setting in ({"presets": []}, {"recall": {"sector_fov": "none"}}):
-        config = RunConfig.model_validate(ARM | setting)
-        completed = complete(config, open_source(config))
-        assert completed.presets == ()
+@pytest.mark.parametrize(
+    ("setting", "used"),
+    [
+        ({"presets": []}, ()),
+        ({"recall": {"sector_fov": "none"}}, ()),
+        ({"recall": {"sector_fov": "whiskers"}}, ("touch",)),
+    ],
+)
+def test_no_preset_is_used_if_the_list_is_empty_or_views_are_not_of_whiskers(setting, used):
+    config, plain = (RunConfig.model_validate(ARM | given) for given in (setting, {}))
+    completed = complete(config, open_source(config))
+    assert completed.presets == used
+    if used:
+        assert completed == complete(plain, open_source(plain))
+    else:
         assert completed.keyframes == config.keyframes
 
 
@@ -117,6 +109,23 @@ def test_the_source_fills_head_cell_size_and_whiskers():
     assert reports.length == source.info.planar_whiskers.length
 
 
+WRENCH = {"plugin": "wrench", "settings": {"simulation": {"path": {"circuits": "C"}}}}
+
+
+def test_touch_without_whiskers_has_the_preset_for_touch_and_no_layout() -> None:
+    SOURCES.register("wrench", tactile_arrays.WRENCH)
+    TOUCH.register("wrench", tactile_arrays.WRENCH_FRONTEND)
+    try:
+        config = RunConfig.model_validate({"source": WRENCH, "touch": {"frontend": {"plugin": "wrench"}}})
+        completed = complete(config, open_source(config))
+        assert complete(completed, open_source(config)) == completed
+    finally:
+        for registry in (SOURCES, TOUCH):
+            registry.unregister("wrench")
+    assert (completed.presets, completed.recall.sector_fov) == (("touch",), "none")
+    assert completed.keyframes.noise.per_cell == PRESETS["touch"]["keyframes"]["noise"]["per_cell"]
+
+
 def test_the_grid_covers_the_odometry_or_the_given_extent():
     config = RunConfig.model_validate(CREATE | {"backend": "grid"})
     source = open_source(config)
@@ -128,36 +137,18 @@ def test_the_grid_covers_the_odometry_or_the_given_extent():
     assert complete(given, source).grid.side == 3.0
 
 
-@pytest.fixture
-def buildings(tmp_path):
-    """Files of two buildings, one name a prefix of the other, and the shared configuration."""
-    for name in ("hall", "hall_2"):
-        for file in ("odom_gt.csv", "scans.csv"):
-            (tmp_path / f"{name}_{file}").touch()
-    return tmp_path
-
-
 @pytest.mark.parametrize("name", ["hall", "hall_2"])
-def test_a_building_is_chosen_by_its_recording_or_by_a_variable(name, buildings, monkeypatch):
+def test_a_building_is_chosen_by_its_recording_or_by_a_variable(name, tmp_path, monkeypatch):
+    """Also of two buildings, one name a prefix of the other."""
     config = ROOT / "configs" / "building.yaml"
-    given = load_config(config, [f"recording.file={buildings / name}_odom_gt.csv"])
-    assert given.recording is not None
-    assert given.recording.table.views is not None
-    assert given.recording.table.views.file == buildings / f"{name}_scans.csv"
-    monkeypatch.setenv("RATSLAM_BUILDING", str(buildings / name))
-    assert load_config(config) == given
-
-
-def test_a_missing_choice_of_building_is_refused(monkeypatch):
     monkeypatch.delenv("RATSLAM_BUILDING", raising=False)
     with pytest.raises(InputError, match="the environment variable RATSLAM_BUILDING is not set"):
-        load_config(ROOT / "configs" / "building.yaml")
-
-
-@pytest.mark.parametrize("name", ["acapulco", "aces", "belgioioso", "freiburg_101"])
-def test_the_shared_configuration_equals_those_of_single_buildings(name, reference_data):
-    folder = (reference_data / "buildings").resolve()
-    if not folder.is_dir():
-        pytest.skip(f"no folder {folder}")
-    given = load_config(ROOT / "configs" / "building.yaml", [f"recording.file={folder / name}_odom_gt.csv"])
-    assert given == load_config(folder / f"{name}.yaml")
+        load_config(config)
+    for file in ("hall_odom_gt", "hall_scans", "hall_2_odom_gt", "hall_2_scans"):
+        (tmp_path / f"{file}.csv").touch()
+    given = load_config(config, [f"recording.file={tmp_path / name}_odom_gt.csv"])
+    assert given.recording is not None
+    assert given.recording.table.views is not None
+    assert given.recording.table.views.file == tmp_path / f"{name}_scans.csv"
+    monkeypatch.setenv("RATSLAM_BUILDING", str(tmp_path / name))
+    assert load_config(config) == given
