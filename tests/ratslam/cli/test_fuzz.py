@@ -10,6 +10,7 @@ import re
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace as altered
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,9 @@ from robot.sources.source import describe
 from tactile.base.se2 import integrate
 from tests.helpers import scenes
 from tests.helpers.command_worker import CommandWorker, Outcome
+from tests.helpers.commands import ROOT, SQUARE
 from tests.helpers.ros_bags import Entry, header, odometry, pose, scan, write_bag
 from tests.helpers.spoilt_files import replace, spoil
-from tests.helpers.square_run import ROOT, copy_square_run
 
 Judge = Callable[[str, Outcome], str]
 BAGS = ("ros1", "ros1-bz2", "ros1-lz4", "sqlite3", "sqlite3-message", "mcap", "mcap-storage")
@@ -38,21 +39,14 @@ SMALL = {
     "rat_simulation": {"seconds": 4.0},
 }
 EXPORTS = ("x.mcap", "x.tum", "x.g2o", "x.json", "x.graphml", "x.yaml", "bag")
-SQUARE = str(ROOT / "configs" / "square.yaml")
 REACH, FLOOR = 8.0, 0.05
 """Range that becomes 1; error of a map below which it is none: m."""
 
 
 @pytest.fixture(scope="module")
 def worker() -> Iterator[CommandWorker]:
-    started = CommandWorker()
-    yield started
-    started.close()
-
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return copy_square_run(tmp_path_factory.mktemp("square") / "run")
+    with closing(CommandWorker()) as started:
+        yield started
 
 
 def fault_of(outcome: Outcome, folder: Path, there: set[Path]) -> str:

@@ -1,41 +1,65 @@
-"""The command run: files, repeats, maps without closures, a full disk."""
+"""The commands run, score and simulate: files, repeats, maps without closures, repaired recordings."""
 
 from __future__ import annotations
 
 import json
 import re
-import resource
 import signal
+import subprocess
+import sys
+import time
 
+import numpy as np
 import pytest
 
+from evaluation.artifacts.run_reader import read_scorecard
 from ratslam.cli import main
 from ratslam.core.backend import NO_CLOSURE
-from tests.ratslam.cli.run_cases import FILES, ROOT, SQUARE, refuses
+from ratslam.runs.build_session import open_source
+from ratslam.runs.run import simulate
+from ratslam.runs.settings.completion import complete
+from ratslam.runs.settings.run_config import RunConfig, load_config
+from robot.recordings.formats import open_recording
+from robot.recordings.mcap_reader import Recording
+from robot.recordings.mcap_writer import record_source
+from robot.recordings.recording_config import RecordingConfig
+from robot.simulation.head.simulated_session import HeadSimulation
+from robot.touch_source import open_touch_source
+from tactile.base.errors import InputError
+from tests.helpers.commands import ROOT, SQUARE, said
+
+FILES = {
+    "online_error.csv", "calibration.yaml", "closures.csv", "config.yaml", "manifest.json", "map.g2o",
+    "map.json", "map.npz", "map.png", "odometry.tum", "online.tum", "scorecard.json", "steps.csv",
+    "trajectory.tum", "truth.tum", "health.json", "map.tum", "timing.csv", "closure_views.npz",
+}  # fmt: skip
 
 
-def test_a_run_writes_all_its_files(square):
+def test_a_run_writes_all_its_files_and_is_scored(capsys, square):
     assert {path.name for path in square.iterdir()} == FILES
     assert json.loads((square / "manifest.json").read_text())["status"] == "complete"
-    card = json.loads((square / "scorecard.json").read_text())["quantities"]["ate_final"]
-    assert card["value"] < card["odometry"] / 2
+    card = json.loads((square / "scorecard.json").read_text())["quantities"]
+    assert card["ate_final"]["value"] < card["ate_final"]["odometry"] / 2
+    assert json.loads(said(capsys, "score", square, "--json"))["quantities"] == card
+
+
+def test_a_broken_scorecard_is_one_line(tmp_path):
+    (tmp_path / "scorecard.json").write_text('{"name": 3}')
+    with pytest.raises(InputError, match=r"malformed \(name: .*\)") as caught:
+        read_scorecard(tmp_path)
+    assert "http" not in str(caught.value).replace("\n", "http")
 
 
 def test_the_written_configuration_gives_the_same_bytes_from_another_folder(square, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["run", str(square / "config.yaml"), "-o", "again"]) == 0
+    assert main(["run", str(square / "config.yaml"), "-o", "again", "--report"]) == 0
     for name in ("steps.csv", "trajectory.tum", "map.tum", "map.g2o", "health.json", "config.yaml"):
         assert (square / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+    assert (tmp_path / "again" / "report.html").read_text(encoding="utf-8").startswith("<!doctype html>")
 
 
-TRACES = (
-    "a_square3",
-    pytest.param("b_figure8_alias", marks=pytest.mark.soak),
-    pytest.param("c_corridor_wrap", marks=pytest.mark.soak),
-    pytest.param("d1_rotation_generic", marks=pytest.mark.soak),
-    pytest.param("e_kidnap", marks=pytest.mark.soak),
-    pytest.param("j_reverse_stop", marks=pytest.mark.soak),
-)
+OTHERS = ("b_figure8_alias", "c_corridor_wrap", "d1_rotation_generic", "e_kidnap", "j_reverse_stop")
+TRACES = ("a_square3", *(pytest.param(name, marks=pytest.mark.soak) for name in OTHERS))
 
 
 def check_odometry(path):
@@ -46,14 +70,15 @@ def check_odometry(path):
     assert not (path / "calibration.yaml").exists()
 
 
-@pytest.mark.parametrize("backend", ["recall", "classic"])
+@pytest.mark.parametrize("backend", ["recall", pytest.param("classic", marks=pytest.mark.soak)])
 @pytest.mark.parametrize("trace", TRACES)
 def test_without_closures_the_map_is_odometry(trace, backend, tmp_path, capsys):
     file = ROOT / "tests" / "golden" / f"{trace}.npz"
-    sets = ["--set", f"recording.file={file}", "--set", "experience.closures=false"]
-    assert main(["run", SQUARE, "-o", str(tmp_path / "run"), *sets, "--set", f"backend={backend}"]) == 0
+    settings = [f"recording.file={file}", "experience.closures=false", f"backend={backend}"]
+    sets = [word for setting in settings for word in ("--set", setting)]
+    text = said(capsys, "run", SQUARE, "-o", tmp_path / "run", *sets)
     check_odometry(tmp_path / "run")
-    *_, done, error, closures, warnings, health = capsys.readouterr().out.splitlines()
+    *_, done, error, closures, warnings, health = text.splitlines()
     assert re.fullmatch(rf"{tmp_path}/run: \d+ steps of {trace} by {backend}, \S+ s, \S+ m by odometry", done)
     assert re.fullmatch(r"ATE, final \(RMS\): (\S+) m, odometry \1 m", error)
     assert re.fullmatch("closures: (none|0 of .*)", closures)
@@ -78,15 +103,116 @@ def test_the_lecture_hall_is_mapped(reference_data, tmp_path, monkeypatch):
     assert card["quantities"]["ate_final"]["value"] <= 1.5
 
 
-def test_a_full_disk_is_one_clear_error(capsys, square, tmp_path):
-    """A limit on the file size makes writes fail as a full disk does."""
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
-        refuses(capsys, ["run", SQUARE, "-o", tmp_path / "run"], "File too large", "free some space")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, before)
-    assert main(["score", str(tmp_path / "run")]) == 0
-    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["status"] == "running"
+def test_a_cut_recording_is_recovered(tmp_path, capsys):
+    with open_recording(RecordingConfig(file=ROOT / "tests" / "golden" / "a_square3.npz")) as source:
+        record_source(source, tmp_path / "whole.mcap")
+    content = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(content[: len(content) * 6 // 10])
+    text = said(capsys, "tools", "recover", tmp_path / "cut.mcap", "-o", tmp_path / "good.mcap")
+    with open_recording(RecordingConfig(file=tmp_path / "good.mcap")) as source:
+        steps = len(list(source))
+    assert 50 < steps < 349
+    assert f"good.mcap: {steps} samples; the rest is lost: " in text
+
+
+# Simulated sessions
+
+CONFIG = "simulation: {path: {explore: 150}, seed: 5}\ntouch: {head: {dead: [4]}}\n"
+REPLAY = "recording: {file: session.mcap}\n"
+SAME = ("trajectory.tum", "online.tum", "odometry.tum", "truth.tum", "steps.csv", "map.g2o", "map.json")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A configuration, its session as a file, and the runs of both."""
+    path = tmp_path_factory.mktemp("simulate")
+    (path / "config.yaml").write_text(CONFIG)
+    (path / "replay.yaml").write_text(REPLAY)
+    assert main(["simulate", str(path / "config.yaml"), "-o", str(path / "session.mcap")]) == 0
+    assert main(["run", str(path / "config.yaml"), "-o", str(path / "direct")]) == 0
+    assert main(["run", str(path / "replay.yaml"), "-o", str(path / "replayed")]) == 0
+    return path
+
+
+def test_a_run_on_the_recording_equals_a_run_on_the_simulation(folder):
+    for name in SAME:
+        assert (folder / "direct" / name).read_bytes() == (folder / "replayed" / name).read_bytes(), name
+    assert (folder / "direct" / "steps.csv").read_text().count("\n") == 151
+
+
+def test_a_manifest_names_the_simulation(folder):
+    config = RunConfig.model_validate({"simulation": {"path": {"explore": 150}, "seed": 5}})
+    session = HeadSimulation(config.simulation)
+    for name in ("direct", "replayed"):
+        made = json.loads((folder / name / "manifest.json").read_text())["simulation"]
+        assert (made["seed"], made["tier"], bool(made["why"])) == (5, "kinematic", True)
+        assert made["sha256"] == Recording(folder / "session.mcap").info.simulation.sha256
+        assert made["sha256"] != session.digest  # its head has a dead whisker
+        manifest = json.loads((folder / "direct" / "manifest.json").read_text())
+        assert manifest["recording"]["sha256"] == made["sha256"]
+    config = load_config(folder / "replayed" / "config.yaml")
+    assert (config.pose_cells.cell_size, config.touch.head.dead) == (0.05, (4,))
+
+
+def test_a_run_can_be_repeated_from_its_configuration(folder, tmp_path):
+    assert main(["run", str(folder / "direct" / "config.yaml"), "-o", str(tmp_path / "again")]) == 0
+    for name in SAME:
+        assert (tmp_path / "again" / name).read_bytes() == (folder / "direct" / name).read_bytes(), name
+
+
+def test_the_same_session_is_the_same_file_and_its_tier_is_printed(folder, tmp_path, capsys):
+    assert main(["simulate", str(folder / "config.yaml"), "-o", str(tmp_path / "again.mcap")]) == 0
+    assert "in the kinematic tier: only contact features" in capsys.readouterr().err
+    assert (tmp_path / "again.mcap").read_bytes() == (folder / "session.mcap").read_bytes()
+    assert (folder / "session.mcap").stat().st_size < 300_000
+    other = ["--set", "simulation.seed=6"]
+    assert main(["simulate", str(folder / "config.yaml"), "-o", str(tmp_path / "other.mcap"), *other]) == 0
+    assert Recording(tmp_path / "other.mcap").digest != Recording(folder / "session.mcap").digest
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_a_recorded_session_gives_the_observations_of_the_simulation(raw, tmp_path):
+    """Both for raw samples and for contact features."""
+    (tmp_path / "config.yaml").write_text("simulation: {path: {explore: 12}, fidelity: quasistatic}\n")
+    path = tmp_path / "session.mcap"
+    arguments = ["simulate", str(tmp_path / "config.yaml"), "-o", str(path), *(["--raw"] if raw else [])]
+    assert main(arguments) == 0
+    assert (path.stat().st_size > 1_000_000) == raw
+    live = RunConfig.model_validate({"simulation": {"path": {"explore": 12}, "fidelity": "quasistatic"}})
+    replay = RunConfig.model_validate({"recording": {"file": path}})
+    given = []
+    for config in (live, replay):
+        source = open_source(config)
+        given.append([sample.reading for sample in open_touch_source(source, complete(config, source).touch)])
+    assert len(given[0]) == len(given[1]) == 12
+    for one, other in zip(*given, strict=True):
+        assert one.odometry == other.odometry
+        assert all(np.array_equal(part, same) for part, same in zip(one[1:], other[1:], strict=True))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.soak)])
+def test_an_interrupted_session_is_complete_and_a_killed_one_readable(number, tmp_path):
+    config, path = tmp_path / "long.yaml", tmp_path / "long.mcap"
+    config.write_text("simulation: {path: {explore: 30000}, mechanics: {poses: 2}}\n")
+    command = [sys.executable, "-m", "ratslam", "simulate", str(config), "-o", str(path)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while process.poll() is None and not (path.exists() and path.stat().st_size > 30_000):
+        time.sleep(0.005)
+    process.send_signal(number)
+    out, messages = process.communicate()
+    interrupted, source = number == signal.SIGINT, Recording(path)
+    assert process.returncode == (130 if interrupted else -signal.SIGKILL), messages
+    assert source.truncated == (not interrupted)
+    assert 16 < source.length < 30_000
+    assert not interrupted or f"{source.length} steps" in out
+    assert source.info.simulation.seed == 0
+
+
+def test_a_maze_file_lies_beside_its_configuration(tmp_path):
+    (tmp_path / "maze.txt").write_text("o---o---o\n|       |\no   o   o\n|       |\no---o---o\n")
+    (tmp_path / "config.yaml").write_text(
+        "simulation: {maze: {file: maze.txt}, path: {loop: [[0, 0], [1, 0], [1, 1], [0, 1]]}}\n"
+    )
+    count, interrupted = simulate(load_config(tmp_path / "config.yaml"), tmp_path / "a.mcap")
+    assert count == Recording(tmp_path / "a.mcap").length
+    assert not interrupted

@@ -12,7 +12,6 @@ import sys
 import time
 from collections import Counter
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,10 +29,9 @@ from ratslam.runs.runner import open_runner
 from ratslam.runs.settings.run_config import load_config
 from tactile.base.errors import InputError
 from tactile.base.se2 import tum_line
+from tests.helpers.commands import ROOT, SQUARE, said
 from tests.helpers.live import until
 
-ROOT = Path(__file__).parents[3]
-CONFIG = ROOT / "configs" / "square.yaml"
 CLASSIC = ("backend=classic", "session.reserve=512")
 STEPS_BEFORE = 5 * CHUNK
 
@@ -42,14 +40,14 @@ STEPS_BEFORE = 5 * CHUNK
 def alone(tmp_path_factory):
     """A finished run that was not watched."""
     folder = tmp_path_factory.mktemp("alone") / "run"
-    assert main(["run", str(CONFIG), "-o", str(folder), "--set", CLASSIC[0], "--set", CLASSIC[1]]) == 0
+    assert main(["run", SQUARE, "-o", str(folder), "--set", CLASSIC[0], "--set", CLASSIC[1]]) == 0
     return folder
 
 
 @contextmanager
 def run_in_progress(folder):
     """The same run after some steps, and what completes it; left without that, it is as if killed."""
-    with open_observations(load_config(CONFIG, CLASSIC)) as (config, source):
+    with open_observations(load_config(SQUARE, CLASSIC)) as (config, source):
         samples = list(source)
         with open_runner(config, source, folder) as runner:
 
@@ -65,21 +63,15 @@ def run_in_progress(folder):
             yield complete
 
 
-@pytest.fixture(scope="module")
-def killed(tmp_path_factory):
-    """A run that was killed in progress."""
-    folder = tmp_path_factory.mktemp("killed") / "run"
-    with run_in_progress(folder):
-        pass
-    assert json.loads((folder / "manifest.json").read_text())["status"] == RUNNING
-    return folder
-
-
 @pytest.fixture
 def running(tmp_path):
     """A run that makes no steps."""
     with run_in_progress(tmp_path / "run"):
         yield tmp_path / "run"
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
 
 
 def test_a_run_in_progress_is_watched_to_its_end_and_is_not_changed(alone, tmp_path):
@@ -94,23 +86,19 @@ def test_a_run_in_progress_is_watched_to_its_end_and_is_not_changed(alone, tmp_p
                 complete()
 
         seen = watch_run(folder, report, every=0.1)
-    steps = int(re.search(r"run: running, (\d+) of 349 steps", lines[0])[1])
-    assert steps == STEPS_BEFORE < 349
+    assert int(re.search(r"run: running, (\d+) of 349 steps", lines[0])[1]) == STEPS_BEFORE < 349
     assert seen.status == "complete"
     assert lines[-1].startswith("run: complete, 349 of 349 steps, ")
     assert pictures[0] != pictures[-1]
     assert all(content.startswith(b"\x89PNG") and content.endswith(b"IEND\xaeB`\x82") for content in pictures)
-    left = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
-    entire = {path.name: path.read_bytes() for path in alone.iterdir()}
+    left, entire = contents(folder), contents(alone)
     assert left.keys() == entire.keys()
     assert {name for name in left if left[name] != entire[name]} <= {"timing.csv"}
 
 
 def test_a_finished_run_is_seen_as_it_is_read(alone, tmp_path, capsys):
-    folder = tmp_path / "run"
-    shutil.copytree(alone, folder)
-    assert main(["watch", str(folder)]) == 0
-    line, shown = capsys.readouterr().out.splitlines()
+    folder = shutil.copytree(alone, tmp_path / "run")
+    line, shown = said(capsys, "watch", folder).splitlines()
     assert "run: complete" in line
     assert str(folder / "watch.png") in shown
     seen, run = RunMonitor(folder).read(), read_run(folder)
@@ -123,28 +111,38 @@ def test_a_finished_run_is_seen_as_it_is_read(alone, tmp_path, capsys):
     assert np.isfinite(seen.sd).all()
 
 
-def test_a_killed_run_is_given_up_at_once(killed, tmp_path, capsys):
+def test_a_killed_run_is_given_up_at_once_and_one_without_its_mapper_has_the_state_of_its_report(
+    tmp_path, capsys
+):
     folder = tmp_path / "run"
-    shutil.copytree(killed, folder)
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert main(["watch", str(folder)]) == 0
-    output = capsys.readouterr().out
-    assert "run: killed" in output
-    assert f"the run was killed; `run --continue {folder}` continues" in output
-    assert before == {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "watch.png"}
-    assert 0 < len(RunMonitor(folder).read().path) <= (folder / "steps.csv").read_text().count("\n") - 1
+    with run_in_progress(folder):
+        pass
+    assert json.loads((folder / "manifest.json").read_text())["status"] == RUNNING
+    before, text = contents(folder), said(capsys, "watch", folder)
+    assert "run: killed" in text
+    assert f"the run was killed; `run --continue {folder}` continues" in text
+    assert contents(folder) == before
+    seen = RunMonitor(folder).read()
+    assert seen.status == "killed"
+    assert 0 < len(seen.path) <= (folder / "steps.csv").read_text().count("\n") - 1
+    (folder / SESSION_REPORT).write_text(json.dumps({"outcome": "mapper_gone"}))
+    text = said(capsys, "watch", folder)  # ends, without patience
+    assert "run: mapper_gone, " in text
+    assert "the run was killed" not in text
+    (folder / SESSION_REPORT).write_text("{")
+    with pytest.raises(InputError, match="the report of a live session"):
+        RunMonitor(folder).read()
 
 
 def test_a_run_that_hangs_is_given_up_after_a_long_silence(running, capsys):
     for path in running.iterdir():
         os.utime(path, (0, time.time() - 100))
-    assert main(["watch", str(running), "--patience", "50"]) == 0
-    output = capsys.readouterr().out
-    assert "run: running" in output
-    assert "silent for 100 s\nno output for 100 s: the run was killed" in output
+    text = said(capsys, "watch", running, "--patience", "50")
+    assert "run: running" in text
+    assert "silent for 100 s\nno output for 100 s: the run was killed" in text
 
 
-def test_the_picture_beside_a_session_shows_its_end(alone, tmp_path):
+def test_the_picture_beside_a_session_shows_its_end(tmp_path):
     """The session ends at once after a picture, and its process of pictures with it."""
     folder = tmp_path / "run"
     with run_in_progress(folder) as complete, monitor() as start_monitor:
@@ -154,20 +152,6 @@ def test_the_picture_beside_a_session_shows_its_end(alone, tmp_path):
     draw_watch(RunMonitor(folder).read(), read_walls(folder)).savefig(tmp_path / "complete.png")
     assert RunMonitor(folder).read().status == "complete"
     assert (folder / "watch.png").read_bytes() == (tmp_path / "complete.png").read_bytes()
-
-
-def test_a_session_that_lost_its_mapper_has_the_state_of_its_report(killed, tmp_path, capsys):
-    folder = tmp_path / "run"
-    shutil.copytree(killed, folder)
-    assert RunMonitor(folder).read().status == "killed"
-    (folder / SESSION_REPORT).write_text(json.dumps({"outcome": "mapper_gone"}))
-    assert main(["watch", str(folder)]) == 0  # ends, without patience
-    said = capsys.readouterr().out
-    assert "run: mapper_gone, " in said
-    assert "the run was killed" not in said
-    (folder / SESSION_REPORT).write_text("{")
-    with pytest.raises(InputError, match="the report of a live session"):
-        RunMonitor(folder).read()
 
 
 def test_ctrl_c_ends_it_and_no_engine_is_loaded(running):
@@ -185,53 +169,29 @@ def test_ctrl_c_ends_it_and_no_engine_is_loaded(running):
     assert process.communicate(timeout=60)[0].splitlines()[-1] == "False 130"
 
 
-@pytest.mark.parametrize("kind", ["unknown", "empty", "file"])
-def test_a_path_without_a_run_is_refused(kind, tmp_path, capsys):
-    folder = tmp_path / kind
-    if kind == "empty":
-        folder.mkdir()
-    if kind == "file":
-        folder.touch()
-    assert main(["watch", str(folder)]) == 2
-    assert f"ratslam: error: {folder}: no " in capsys.readouterr().err
-    assert not (folder / "watch.png").exists()
-
-
-def test_invalid_times_are_refused(tmp_path, capsys):
-    for option, value in (("--every", "0"), ("--patience", "nan")):
-        assert main(["watch", str(tmp_path), option, value]) == 2
-        assert option in capsys.readouterr().err
-
-
 # The files of a run at any moment
 
 
 def files(steps, random, truth=True):
     """The streams of a run of so many steps."""
-    pose = random.normal(size=(steps, 3))
     rows = ["t,place,action,x,y,heading,sd_x,sd_y,sd_heading,lost,outcome,match"]
-    for k, row in enumerate(pose.tolist()):
+    for k, row in enumerate(random.normal(size=(steps, 3)).tolist()):
         cells = [k / 4, k, "none", *row, 0.1, 0.2, 0.3, k % 2, ("ok", "reseeded")[k % 3 == 1], ""]
         rows.append(",".join(map(str, cells)))
-    tum = [
-        "".join(tum_line(k / 4, p) for k, p in enumerate(random.normal(size=(steps, 3)))) for _ in range(2)
-    ]
-    known = tum[1] if truth else ""
+    odometry, known = (
+        "".join(tum_line(k / 4, pose) for k, pose in enumerate(random.normal(size=(steps, 3))))
+        for _ in range(2)
+    )
     return {
         "steps.csv": "\n".join(rows) + "\n",
-        "odometry.tum": tum[0],
-        "truth.tum": known,
+        "odometry.tum": odometry,
+        "truth.tum": known if truth else "",
         "online_error.csv": "t,error\n" + "".join(f"{k / 4},{k}\n" for k in range(0, steps, 3)),
     }
 
 
-def same(one, other):
-    """Whether two readings of the progress are equal, apart from the times."""
-    rest = {"rate": None, "silence": 0.0}
-    parts = zip(one._replace(**rest), other._replace(**rest), strict=True)
-    return all(
-        np.array_equal(a, b, equal_nan=True) if isinstance(a, np.ndarray) else a == b for a, b in parts
-    )
+def timeless(seen):
+    return repr(seen._replace(rate=None, silence=0.0))
 
 
 @settings(max_examples=25)
@@ -249,19 +209,23 @@ def test_lines_written_in_any_pieces_give_the_same_progress(tmp_path_factory, st
         assert len(seen.path) == len(seen.odometry) == len(seen.truth) == sum(seen.outcomes.values()) <= steps
     assert len(seen.path) == steps
     assert seen.status == RUNNING
-    assert same(seen, RunMonitor(folder).read())
+    assert timeless(seen) == timeless(RunMonitor(folder).read())
     assert np.isfinite(seen.truth).all() == (truth or not steps)
     assert seen.lost == steps // 2
 
 
-@pytest.mark.parametrize("truth", [True, False])
-@pytest.mark.parametrize("steps", [0, 1, 2, 9])
-def test_the_same_progress_has_the_same_picture(steps, truth, tmp_path):
+def written(folder, steps, truth=True):
     for stream, text in files(steps, np.random.default_rng(1), truth).items():
-        (tmp_path / stream).write_text(text)
-    for name in ("a", "b")[: 1 + (steps == 9)]:
-        draw_watch(RunMonitor(tmp_path).read()).savefig(tmp_path / f"{name}.png")
-    assert steps < 9 or (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+        (folder / stream).write_text(text)
+    return RunMonitor(folder)
+
+
+def test_a_run_of_any_length_has_a_picture(tmp_path):
+    for steps in (0, 1, 2, 9):
+        for truth in (True, False):
+            draw_watch(written(tmp_path, steps, truth).read()).savefig(tmp_path / "a.png")
+    draw_watch(RunMonitor(tmp_path).read()).savefig(tmp_path / "b.png")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 @pytest.mark.parametrize(("name", "line"), [
@@ -270,9 +234,7 @@ def test_the_same_progress_has_the_same_picture(steps, truth, tmp_path):
     ("online_error.csv", "1.0,far\n"),
 ])  # fmt: skip
 def test_the_error_for_a_broken_line_names_it(name, line, tmp_path):
-    for stream, text in files(3, np.random.default_rng(0)).items():
-        (tmp_path / stream).write_text(text)
-    monitor = RunMonitor(tmp_path)
+    monitor = written(tmp_path, 3)
     monitor.read()
     count = (tmp_path / name).read_text().count("\n")
     with (tmp_path / name).open("a") as file:
@@ -281,22 +243,16 @@ def test_the_error_for_a_broken_line_names_it(name, line, tmp_path):
         monitor.read()
 
 
-def test_a_removed_run_directory_is_an_error(tmp_path):
-    folder = tmp_path / "run"
-    folder.mkdir()
+def test_the_monitors_own_picture_does_not_end_the_silence_and_a_removed_directory_is_an_error(tmp_path):
+    (folder := tmp_path / "run").mkdir()
     (folder / "steps.csv").touch()
+    os.utime(folder / "steps.csv", (0, time.time() - 100))
+    (folder / "watch.png").touch()
     monitor = RunMonitor(folder)
-    assert monitor.read().status == RUNNING
+    assert 99 < monitor.read().silence < 200
     shutil.rmtree(folder)
     with pytest.raises(InputError, match="cannot be read"):
         monitor.read()
-
-
-def test_the_monitors_own_picture_does_not_end_the_silence(tmp_path):
-    (tmp_path / "steps.csv").touch()
-    os.utime(tmp_path / "steps.csv", (0, time.time() - 100))
-    (tmp_path / "watch.png").touch()
-    assert 99 < RunMonitor(tmp_path).read().silence < 200
 
 
 def test_the_status_line_shows_steps_distance_pace_and_outcomes():

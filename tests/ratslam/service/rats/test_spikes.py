@@ -1,6 +1,9 @@
-"""Laws of the spikes: their counts are Poisson with the integral of the rate, and each cell stands alone."""
+"""Spikes: laws of their counts and times, and their files: NWB that pynwb accepts, NumPy, scores of cells."""
 
 from __future__ import annotations
+
+import importlib
+import sys
 
 import numpy as np
 import pytest
@@ -8,9 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from evaluation.cells.analysis import analyse_cells
+from evaluation.cells.recording import CellRecording, write_recording
 from ratslam.classic.config import NetworkConfig
+from ratslam.service.export_formats import EPOCH, export_run, write_nwb
 from ratslam.service.spikes import (
     SpikeConfig,
+    cell_poses,
     draw_spikes,
     expected_spikes,
     read_spikes,
@@ -18,7 +25,31 @@ from ratslam.service.spikes import (
     write_spikes,
 )
 from tactile.base.errors import InputError
-from tests.ratslam.service.rats.recordings import drawn_recording, recording
+from tests.helpers.commands import said
+
+SHAPE = (8, 7, 7)
+
+
+def recording(time: np.ndarray, cell: list[int], activity: np.ndarray) -> CellRecording:
+    """A recording of a network of 8 x 7 x 7 cells of 0.1 m; the robot drives along x, its heading turns."""
+    steps = len(time)
+    truth = np.stack([0.05 * time, np.zeros(steps), 0.1 * time], axis=1)
+    packet = np.stack([np.arange(steps) % 7, np.full(steps, 3.0), np.arange(steps) % 8], axis=1)
+    return CellRecording(
+        shape=SHAPE, cell_size=0.1, time=time, truth=truth, packet=packet, energy=np.zeros(steps),
+        place=np.full(steps, -1, np.int32), cell=np.array(cell, np.int32),
+        activity=activity.astype(np.float32), sums=None,
+    )  # fmt: skip
+
+
+def drawn_recording(seed: int, cell: list[int], steps: int = 400) -> CellRecording:
+    """Unevenly spaced steps, and an activity of each cell of its own with silent stretches."""
+    time = 3.0 + np.cumsum(np.random.default_rng(seed).uniform(0.0, 0.1, steps))
+    activity = [
+        np.maximum(np.random.default_rng([seed, index]).normal(0.01, 0.02, steps), 0) for index in cell
+    ]
+    return recording(time, cell, np.stack(activity, axis=1))
+
 
 REFERENCE = 0.04
 SEEDS = range(400)
@@ -107,9 +138,7 @@ def test_files_hold_all_and_equal_spikes_give_equal_bytes(tmp_path):
         np.testing.assert_array_equal(one, other)
 
 
-def test_other_files_are_no_spikes(tmp_path):
-    with pytest.raises(InputError, match="no such file; expected a file of spikes"):
-        read_spikes(tmp_path / "none.npz")
+def test_a_damaged_file_of_spikes_is_refused(tmp_path):
     np.savez(tmp_path / "other.npz", cell=np.zeros(2), count=np.zeros(3), times=[], interval=[0.0, 1.0])
     with pytest.raises(InputError, match="do not fit each other"):
         read_spikes(tmp_path / "other.npz")
@@ -139,3 +168,105 @@ def test_bad_input_gets_one_clear_error(change, reference, message):
 
 def test_the_reference_is_the_peak_of_a_packet_at_rest():
     assert settled_peak(NetworkConfig()) == pytest.approx(0.042770, abs=1e-6)
+
+
+# Files
+
+CHOSEN = [5, 1, 300]
+CONFIG = "recording: {file: none.bag}\npose_cells: {cells_xy: 7, cells_heading: 8}\n"
+NETWORK = NetworkConfig(cells_xy=7, cells_heading=8)
+
+
+@pytest.fixture(scope="module")
+def pynwb():
+    """The package, which takes seconds to import."""
+    return importlib.import_module("pynwb")
+
+
+@pytest.fixture
+def three():
+    """Three cells, of which the last is silent; the true pose is unknown at one step."""
+    made = drawn_recording(0, CHOSEN)
+    made.activity[:, 2] = 0.0
+    made.truth[3] = np.nan
+    return made
+
+
+@pytest.fixture
+def run(three, tmp_path):
+    """A run directory with what an export of spikes reads."""
+    directory = tmp_path / "run"
+    directory.mkdir()
+    (directory / "config.yaml").write_text(CONFIG)
+    write_recording(directory / "cells.npz", three)
+    return directory
+
+
+def test_the_validator_accepts_the_file_and_it_holds_all(run, three, tmp_path, pynwb, capsys):
+    for name in ("run.nwb", "again.nwb"):
+        said(capsys, "export", run, "-o", tmp_path / name, "--peak-rate", "30")
+    assert (tmp_path / "run.nwb").read_bytes() == (tmp_path / "again.nwb").read_bytes()
+    assert pynwb.validate(path=str(tmp_path / "run.nwb")) == []
+    spikes = draw_spikes(three, settled_peak(NETWORK), SpikeConfig(peak_rate=30))
+    assert sum(map(len, spikes.times)) > 100
+    with pynwb.NWBHDF5IO(tmp_path / "run.nwb", "r") as source:
+        file = source.read()
+        assert file.session_start_time == EPOCH
+        assert len(file.identifier) == 64
+        units = file.units
+        for k, times in enumerate(spikes.times):
+            np.testing.assert_array_equal(units.get_unit_spike_times(k), times)
+            np.testing.assert_array_equal(units.get_unit_obs_intervals(k), [[spikes.start, spikes.stop]])
+        np.testing.assert_array_equal(units["cell"][:], CHOSEN)
+        poses = np.stack([units[name][:] for name in ("x", "y", "heading")], axis=1)
+        np.testing.assert_array_equal(poses, cell_poses(three.shape, 0.1, np.array(CHOSEN)))
+        behaviour = file.processing["behavior"]
+        position, heading = behaviour["Position"]["position"], behaviour["CompassDirection"]["heading"]
+        np.testing.assert_array_equal(position.data, three.truth[:, :2])
+        np.testing.assert_allclose(heading.data, three.truth[:, 2], atol=1e-12)
+        packet = behaviour["PacketPosition"]["packet_position"]
+        np.testing.assert_allclose(packet.data, 0.1 * three.packet[:, :2])
+        np.testing.assert_array_equal(packet.timestamps, three.time)
+        angle = behaviour["PacketDirection"]["packet_heading"].data[:]
+        np.testing.assert_allclose(np.exp(1j * angle), np.exp(2j * np.pi / 8 * three.packet[:, 2]))
+        np.testing.assert_array_equal(file.acquisition["activity"].data, three.activity)
+        assert len(file.acquisition["injected_energy"].data) == len(three.time)
+
+
+def test_numpy_spikes_are_those_of_the_settings(run, three, tmp_path, capsys):
+    said(capsys, "export", run, "-o", tmp_path / "s.npz", "--peak-rate", "5", "--spike-seed", "3")
+    again = draw_spikes(three, settled_peak(NETWORK), SpikeConfig(peak_rate=5, seed=3))
+    for one, other in zip(read_spikes(tmp_path / "s.npz").times, again.times, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_cells_without_any_spike_are_valid(three, tmp_path, pynwb):
+    three.activity[:] = 0.0
+    write_nwb(tmp_path / "silent.nwb", three, draw_spikes(three, 1.0), "digest")
+    assert pynwb.validate(path=str(tmp_path / "silent.nwb")) == []
+
+
+def test_spikes_without_chosen_cells_or_of_others_or_without_pynwb_are_refused(
+    run, three, tmp_path, monkeypatch
+):
+    none = three._replace(cell=three.cell[:0], activity=three.activity[:, :0])
+    write_recording(run / "cells.npz", none)
+    with pytest.raises(InputError, match=r"no chosen cells.*add `cells: {chosen: 64}`"):
+        export_run(run, tmp_path / "run.nwb")
+    spikes = draw_spikes(drawn_recording(0, [1, 2]), 1.0)
+    with pytest.raises(InputError, match="other cells than those of the recording"):
+        write_nwb(tmp_path / "run.nwb", three, spikes, "digest")
+    monkeypatch.setitem(sys.modules, "pynwb", None)
+    with pytest.raises(InputError, match=r"pip install 'ratslam\[nwb\]'"):
+        write_nwb(tmp_path / "run.nwb", three, draw_spikes(three, 1.0), "digest")
+    assert list(tmp_path.iterdir()) == [run]
+
+
+def test_scores_are_a_line_for_each_cell_in_hz(run, three, tmp_path, capsys):
+    three.truth[:] = np.random.default_rng(1).random(three.truth.shape)
+    write_recording(run / "cells.npz", three)
+    said(capsys, "export", run, "-o", tmp_path / "cells.csv", "--peak-rate", "30")
+    table = np.genfromtxt(tmp_path / "cells.csv", delimiter=",", names=True)
+    scores = analyse_cells(three, 30 / settled_peak(NETWORK))
+    np.testing.assert_array_equal(table["cell"], CHOSEN)
+    np.testing.assert_array_equal(table["mean_rate"], scores.mean_rate)
