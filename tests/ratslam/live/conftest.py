@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.ratslam.live.bench import Bench
-from tests.ratslam.live.server_process import SessionServer
+from tests.ratslam.live.bench import Bench, CreateBench
+from tests.ratslam.live.live_session import SessionServer
 
 
 @pytest.fixture(scope="session")
@@ -30,3 +30,19 @@ def bench(table: Bench) -> Bench:
     """Emulators in their initial state."""
     table.ready()
     return table
+
+
+@pytest.fixture(scope="module")
+def create_table(
+    loopback: str, server: SessionServer, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[CreateBench]:
+    bench = CreateBench(loopback, server, tmp_path_factory.mktemp("create"))
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def robot(create_table: CreateBench) -> CreateBench:
+    """An emulated Create without faults."""
+    create_table.ready()
+    return create_table

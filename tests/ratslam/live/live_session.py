@@ -1,4 +1,4 @@
-"""A session's processes, its output and its files."""
+"""Sessions that a server forks: processes, output, files, the content of a recording."""
 
 from __future__ import annotations
 
@@ -6,39 +6,106 @@ import json
 import os
 import signal
 import subprocess
-from collections.abc import Callable
-from contextlib import suppress
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from tests.helpers.live import PATIENCE, until
-from tests.ratslam.live.forked_process import Forked
-from tests.ratslam.live.recorded_data import RecordedData, read_recorded
+import numpy as np
+
+from robot.drivers.head.decoder import Frames
+from robot.recordings.cdr import Event
+from robot.recordings.mcap_reader import McapScanner
+from robot.sources.source import Sample
+from tests.helpers.live import PATIENCE, ROOT, until
+
+SAMPLES = 2000.0
+"""Frames of the head in a second."""
+CODES = {"complete": (0,), "interrupted": (130, 143)}
+"""Exit codes of outcomes; that of all others is 2."""
+
+
+class Moment(NamedTuple):
+    """A moment by the devices' clocks: s of the controller, number of the head's newest sample."""
+
+    robot: float
+    sample: int
+
+
+class RecordedData(NamedTuple):
+    """Content of a recording."""
+
+    sequence: np.ndarray
+    robot: np.ndarray
+    samples: list[Sample]
+    events: list[Event]
+    broken: str
+
+    def lost(self, until: Moment) -> float:
+        """Duration of the data missing at the end of the recording, of either device, s."""
+        return max(until.robot - float(self.robot[-1]), (until.sample - int(self.sequence[-1])) / SAMPLES)
+
+    def names(self) -> list[str]:
+        return [event.name for event in self.events]
+
+
+def read_recorded(path: Path) -> RecordedData:
+    """Reads a recording, complete or not."""
+    walk = McapScanner(path)
+    sequence, robot, samples, events = [], [], [], []
+    for entry in walk.entries():
+        if isinstance(entry.content, Frames):
+            sequence.append(entry.content.sequence)
+        elif isinstance(entry.content, np.ndarray):
+            robot.append(entry.content["robot"])
+        elif isinstance(entry.content, Event):
+            events.append(entry.content)
+        else:
+            samples.append(entry.content)
+    return RecordedData(np.concatenate(sequence), np.concatenate(robot), samples, events, walk.broken)
+
+
+def raise_priority(pid: int) -> None:
+    """Raises the priority of a process and its children where allowed, because they work in real time."""
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, pid, -10)
+
+
+def child_of(parent: int, word: bytes) -> int:
+    """Process id of the child of a process that has a word in its command line."""
+    for listed in Path(f"/proc/{parent}/task").glob("*/children"):
+        for child in listed.read_text().split():
+            with suppress(OSError):
+                if word in Path(f"/proc/{child}/cmdline").read_bytes():
+                    return int(child)
+    raise AssertionError(f"process {parent} has no child {word!r}")
 
 
 class Session:
-    """A session's process.
+    """A session: its process, the directory of its run, its output (`log`)."""
 
-    Attributes:
-        directory: of its run. log: its output.
-    """
-
-    def __init__(self, folder: Path, process: Forked) -> None:
-        self.directory, self.log, self.process = folder / "run", folder / "log", process
+    def __init__(self, folder: Path, pid: int) -> None:
+        self.directory, self.log, self.pid = folder / "run", folder / "log", pid
+        self._code = folder / "code"
 
     def output(self) -> str:
         return self.log.read_text(errors="replace")
+
+    def ended(self) -> bool:
+        return self._code.exists()
 
     def until(self, condition: Callable[[], Any], what: str) -> Any:
         """As `tests.helpers.live.until`; fails at once when the session has ended."""
 
         def met() -> Any:
             found = condition()
-            assert found or self.process.poll() is None, self.output()
+            assert found or not self.ended(), self.output()
             return found
 
         try:
-            return until(met, what)
+            return until(met, what, 4 * PATIENCE)
         except AssertionError:
             print(self.output())
             raise
@@ -47,54 +114,107 @@ class Session:
         """Waits for a text in its output."""
         self.until(lambda: text in self.output(), f"{text!r} is said")
 
-    def code(self, seconds: float = 2 * PATIENCE) -> int:
+    def code(self, seconds: float = 4 * PATIENCE) -> int:
         """Waits for its end; returns the exit code."""
-        try:
-            return self.process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            print(self.output())
-            raise
+        until(self.ended, f"the session ends\n{self.output()}", seconds)
+        return int(self._code.read_text())
 
     def report(self) -> dict[str, Any]:
         """Content of `live.json`."""
         report: dict[str, Any] = json.loads((self.directory / "live.json").read_text())
         return report
 
+    def ends(self, outcome: str) -> dict[str, Any]:
+        """The report of a session that ends by itself with an outcome."""
+        code, report = self.code(), self.report()
+        assert report["outcome"] == outcome, self.output()
+        assert code in CODES.get(outcome, (2,))
+        assert f"{outcome}: " in self.output()
+        assert "Traceback" not in self.output(), self.output()
+        return report
+
+    def is_refused(self, *texts: str) -> None:
+        """Checks that it ends with an error that has these texts, before there is a run directory."""
+        assert self.code() == 2, self.output()
+        assert "Traceback" not in self.output(), self.output()
+        for text in texts:
+            assert text in self.output()
+        assert not self.directory.exists()
+
     def recorded(self) -> RecordedData:
         """Content of its recording."""
         return read_recorded(self.directory / "session.mcap")
 
-    def child(self) -> int:
-        """Process id of its RTDE process."""
-        for folder in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):
-                words = (folder / "cmdline").read_bytes().split(b"\0")
-                if (
-                    b"robot.drivers.ur10.rtde_process" in words
-                    and os.getpgid(int(folder.name)) == self.process.pid
-                ):
-                    return int(folder.name)
-        raise AssertionError("no process of the arm")
-
-    def lives(self) -> bool:
-        """Whether any of its processes runs."""
-        for folder in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):
-                if os.getpgid(int(folder.name)) == self.process.pid and _runs(folder):
-                    return True
-        return False
+    def child(self, word: bytes) -> int:
+        """Process id of its child that has a word in its command line."""
+        return child_of(self.pid, word)
 
     def mapper(self) -> int:
         """Process id of its mapper."""
-        return int((self.directory / "mapper.pid").read_text())
+        return self.child(b"spawn_main")
 
-    def end(self) -> None:
-        """Kills its processes."""
+    def lives(self) -> bool:
+        """Whether any of its processes runs; a zombie does not."""
+        for folder in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                state = (folder / "stat").read_text().rsplit(")", 1)[1].split()[0]
+                if os.getpgid(int(folder.name)) == self.pid and state != "Z":
+                    return True
+        return False
+
+    def send(self, number: int) -> float:
+        """Sends a signal to its process, unless it has ended; returns the time, s, host."""
         with suppress(ProcessLookupError):
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait(PATIENCE)
+            os.kill(self.pid, number)
+        return time.monotonic()
+
+    def send_to_all(self, number: int) -> None:
+        """Sends a signal to all of its processes."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.pid, number)
 
 
-def _runs(folder: Path) -> bool:
-    """Whether a process runs; a zombie does not."""
-    return (folder / "stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+class SessionServer:
+    """A process that has loaded all modules and forks sessions."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._count = folder, 0
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.ratslam.live.session_server"],
+            cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
+        )  # fmt: skip
+        assert self._process.stdout.readline() == "ready\n"
+
+    @contextmanager
+    def session(
+        self, config: dict[str, Any], options: Sequence[str] = (), mapper: float | None = 0.0, **order: Any
+    ) -> Iterator[Session]:
+        """A session, started; its processes end with the block.
+
+        Args:
+            config: its configuration. options: more of `live`. mapper: s that the stub takes for each
+                sample; None: no stub, the mapper itself.
+            order: `rate_check`: whether it listens to the head for as long as in use and checks its rate;
+                `environment`: variables.
+        """
+        self._count += 1
+        folder = self._folder / str(self._count)
+        folder.mkdir()
+        file, log = folder / "config.yaml", folder / "log"
+        file.write_text(json.dumps(config))
+        log.touch()
+        arguments = ["live", str(file), "-o", str(folder / "run"), *options]
+        order = {"environment": {}, "rate_check": False} | order
+        order |= {"folder": str(folder), "arguments": arguments, "mapper": mapper}
+        self._process.stdin.write(json.dumps(order) + "\n")
+        session = Session(folder, int(self._process.stdout.readline()))
+        raise_priority(session.pid)
+        try:
+            yield session
+        finally:
+            session.send_to_all(signal.SIGKILL)
+            session.code()
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.communicate()

@@ -9,17 +9,18 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS, Faults, until
-from tests.ratslam.live.forked_process import raise_priority
-from tests.ratslam.live.recorded_data import read_recorded
+from ratslam.examples import dead_reckoning
+from tests.helpers.distributions import install
+from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS, started, until
+from tests.ratslam.live.live_session import child_of, raise_priority, read_recorded
 
 CONFIG = str(ROOT / "configs" / "live_maze.yaml")
 REPLAY = """
@@ -40,32 +41,7 @@ PATIENT = (
     "live.residual=1", "live.room=0",
 )  # fmt: skip
 """Long time-outs: emulators and session share a busy machine."""
-
-
-@contextmanager
-def emulated(what: str, port: int, host: str, *settings: str) -> Iterator[Faults]:
-    """`emulate` in a process that ends with the block."""
-    command = [sys.executable, "-m", "ratslam", "emulate", what, CONFIG, "--host", host, "--ur-host", host]
-    process = subprocess.Popen([*command, *settings], cwd=ROOT, stdout=subprocess.PIPE)
-    faults = Faults(process, host, port)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline().strip().endswith(b"ready")
-        raise_priority(process.pid)
-        yield faults
-    finally:
-        faults.close()
-        process.kill()
-        process.wait(5)
-        assert process.stdout is not None
-        process.stdout.close()
-
-
-def mapper_of(session: int) -> int:
-    """Process id of its mapper."""
-    children = Path(f"/proc/{session}/task/{session}/children").read_text().split()
-    (found,) = (pid for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes())
-    return int(found)
+SHORT = (*PATIENT, "live.plan.whisking.rate=2", "live.budget=3", "live.plan.calibration.min_duration=2")
 
 
 def _begun(session: subprocess.Popen, log: Path) -> bool:
@@ -76,40 +52,48 @@ def _begun(session: subprocess.Popen, log: Path) -> bool:
 
 
 def complete_session(
-    host: str, folder: Path, *settings: str, longest: float, freeze: float = 0.0, options: Sequence[str] = ()
+    host: str,
+    folder: Path,
+    *settings: str,
+    longest: float,
+    freeze: float = 0.0,
+    options: Sequence[str] = (),
+    outcome: str = "complete",
 ) -> Path:
-    """The run directory of a session that completes, on emulators of its own.
+    """The run directory of a session that ends as planned, on emulators of its own.
 
     Args:
         longest: s that it may take. freeze: s for which its mapper is stopped on the way.
         options: more of `live`.
     """
     given = [word for setting in settings for word in ("--set", setting)]
-    directory = folder / "live"
-    with (
-        emulated("ur10", UR_FAULTS, host, *given) as arm,
-        emulated("head", HEAD_FAULTS, host, *given) as head,
-    ):
+    directory, log = folder / "live", folder / "log"
+    hosts = [CONFIG, "--host", host, "--ur-host", host]
+    with ExitStack() as stack:
+        arm, head = (
+            stack.enter_context(started(["-m", "ratslam", "emulate", what, *hosts, *given], port, host))
+            for what, port in (("ur10", UR_FAULTS), ("head", HEAD_FAULTS))
+        )
         command = [sys.executable, "-m", "ratslam", "live", CONFIG, "--ur-host", host, "--head", host]
-        with (folder / "log").open("wb") as log:
-            process = subprocess.Popen(
-                [*command, "-o", str(directory), *given, *options],
-                cwd=ROOT, stdout=log, stderr=log,
-            )  # fmt: skip
-            raise_priority(process.pid)
-            try:
-                if freeze and until(partial(_begun, process, folder / "log"), "the third whisk"):
-                    mapper = mapper_of(process.pid)
-                    os.kill(mapper, signal.SIGSTOP)
-                    time.sleep(freeze)
-                    os.kill(mapper, signal.SIGCONT)
-                code = process.wait(longest)
-            finally:
-                process.kill()
-                process.wait(5)
-        output = (folder / "log").read_text()
+        process = subprocess.Popen(
+            [*command, "-o", str(directory), *given, *options],
+            cwd=ROOT, stdout=stack.enter_context(log.open("wb")), stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        for pid in (arm.process.pid, head.process.pid, process.pid):
+            raise_priority(pid)
+        try:
+            if freeze and until(partial(_begun, process, log), "the third whisk"):
+                mapper = child_of(process.pid, b"spawn_main")
+                os.kill(mapper, signal.SIGSTOP)
+                time.sleep(freeze)
+                os.kill(mapper, signal.SIGCONT)
+            code = process.wait(longest)
+        finally:
+            process.kill()
+            process.wait(5)
+        output = log.read_text()
         assert code == 0, output
-        assert "complete: " in output
+        assert f"{outcome}: " in output
         assert "clocks: head" in output, "the self-test has found the head's rate"
         assert "Traceback" not in output
         state = arm.state()
@@ -154,8 +138,7 @@ def check_session(directory: Path, whisks: int, same: Sequence[str] = SAME) -> d
 def test_a_session_and_its_replay(loopback: str, tmp_path: Path) -> None:
     """The mapper is stopped for a while: images dropped live are dropped in the replay too. A view changes
     nothing."""
-    settings = [*PATIENT, "live.whisks=14", "live.plan.whisking.rate=2", "live.budget=3"]
-    settings += ["live.plan.calibration.min_duration=2"]
+    settings = [*SHORT, "live.whisks=14"]
     view = tmp_path / "view.rrd"
     directory = complete_session(
         loopback, tmp_path, *settings, longest=280, freeze=4.5, options=["--rerun", str(view)]
@@ -185,3 +168,16 @@ def test_ten_minutes_and_their_replay(loopback: str, tmp_path: Path, hz: int) ->
     assert report["lateness_s"]["p99"] <= 0.05
     assert report["state_age_s"]["p99"] <= 0.02
     assert report["mapper_s"]["p99"] <= 0.6
+
+
+@pytest.mark.soak
+def test_a_backend_of_another_package_maps_live(loopback: str, tmp_path: Path, monkeypatch) -> None:
+    """The mapper process finds its entry point; the replay gives the same bits."""
+    module = Path(dead_reckoning.__file__).read_text(encoding="utf-8")
+    install(tmp_path / "site", "own_reckoning", module, {"ratslam.backends:reckoning": "own_reckoning:ENTRY"})
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
+    settings = [*SHORT, "live.whisks=6", "backend=reckoning", "backend_settings.scale=0.5"]
+    directory = complete_session(loopback, tmp_path, *settings, longest=280)
+    check_session(directory, 6, [name for name in SAME if not name.startswith("map.") or name == "map.tum"])
+    assert "distance" in (directory / "steps.csv").read_text().splitlines()[0].split(",")
+    assert json.loads((directory / "manifest.json").read_text())["status"] == "complete"

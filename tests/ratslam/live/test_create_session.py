@@ -1,12 +1,19 @@
-"""Short sessions on an emulated Create: complete and repeated, and ended by a fault."""
+"""Sessions on an emulated Create: complete and repeated, and ended by a fault.
+
+`pytest tests/ratslam/live/test_create_session.py --soak -s` applies the usual time limits and prints a line
+for each fault: outcome, and the time until the wheels stood, by the robot's own log.
+"""
 
 from __future__ import annotations
 
+import itertools
+import json
+import os
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -19,69 +26,161 @@ from robot.recordings.mcap_reader import Recording
 from tactile.base.errors import InputError
 from tactile.base.types import MotionKind, StepEnd
 from tactile.whisker_geometry import HeadConfig
-from tests.helpers.live import PATIENCE, until
-from tests.ratslam.live.create_bench import CreateBench, child_of, create_bench, kill
+from tests.helpers.live import until
+from tests.ratslam.live.bench import PLAN, SLACK, CreateBench
 from tests.ratslam.live.live_session import Session
-from tests.ratslam.live.server_process import SessionServer
 
 pytest.importorskip("serial", reason="needs pyserial")
 pytest.importorskip("termios", reason="needs pseudo-terminals")
-SAME = ("steps.csv", "trajectory.tum", "online.tum", "odometry.tum")
-SLACK = {"patience": 5.0, "silence": 2.0, "replug": 20.0, "stuck": 0.8}
-"""Time limits for a busy machine, and a short one for the bumper."""
+SAME = ("steps.csv", "online.tum", "odometry.tum", "trajectory.tum")
+HOLD = 0.5
+"""s: `patience` of the driver, and the longest time until the robot stands after a kill."""
+HANG, SILENCE = HOLD + 0.1, HOLD + 0.3
+KILLED = ("session", "mapper", "watchdog")
+WATCHDOG = b"robot.drivers.create.watchdog"
+IN_TIME = [pytest.mark.soak, pytest.mark.timeout(1200)]
 
 
-@pytest.fixture(scope="module")
-def table(loopback: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[CreateBench]:
-    with create_bench(loopback, tmp_path_factory.mktemp("create")) as bench:
-        yield bench
+class Fault(NamedTuple):
+    """Attributes:
+    outcome: of the session, "" if it was killed. limit: s until the wheels stand; inf if nothing can stop
+        the robot. request: of the emulated robot. sent: a signal to the session, or to its child.
+    """
+
+    outcome: str
+    limit: float
+    request: dict[str, Any] = {}  # noqa: RUF012
+    sent: int = 0
+    child: bytes = b""
 
 
-@pytest.fixture
-def robot(table: CreateBench) -> CreateBench:
-    """The emulated robot without faults."""
-    table.robot("clear")
-    table.robot("plug")
-    return table
+FAULTS = {
+    "Ctrl-C": Fault("interrupted", HOLD, sent=signal.SIGINT),
+    "bumper stuck": Fault("bumper_stuck", 3.0 + HOLD, {"do": "bump"}),
+    "wheel drop": Fault("wheel_drop", HOLD, {"do": "drop"}),
+    "cliff": Fault("left_safe_mode", HOLD, {"do": "cliff"}),
+    "silent": Fault("robot_silent", SILENCE, {"do": "lose", "replies": 10**9}),
+    "garbage": Fault("robot_garbled", SILENCE, {"do": "scramble", "replies": 10**9}),
+    "unplugged": Fault("link_lost", HOLD, {"do": "unplug"}),
+    "killed session": Fault("", HOLD, sent=signal.SIGKILL),
+    "unplugged and killed session": Fault("", HOLD, {"do": "unplug"}, sent=signal.SIGKILL),
+    "killed mapper": Fault("mapper_gone", HOLD, sent=signal.SIGKILL, child=b"spawn_main"),
+    "killed watchdog": Fault("watchdog_gone", HOLD, sent=signal.SIGKILL, child=WATCHDOG),
+    "killed emulator": Fault("link_lost", np.inf),
+    "hanging session": Fault("host_late", HANG, sent=signal.SIGSTOP),
+    "hanging watchdog": Fault("watchdog_gone", HANG, sent=signal.SIGSTOP, child=WATCHDOG),
+}
+QUICK = ("Ctrl-C", "bumper stuck", "wheel drop", "unplugged", *(f"killed {what}" for what in KILLED))
+"""What every run of the suite tests."""
 
 
-@contextmanager
-def rolling(robot: CreateBench, server: SessionServer, **settings: Any) -> Iterator[Session]:
-    """A session with a stub mapper, when the robot has driven two steps and rolls."""
-    live = robot.live(**(SLACK | settings)) | {"head": {"address": robot.host, "silence": 5.0}}
-    before = robot.state()["travelled"]
-    session = server.start({"live": live, "backend": "grid"})
-    try:
-        session.until(lambda: robot.rolls() and robot.state()["travelled"] > before + 0.05, "two steps")
-        yield session
-    finally:
-        session.end()
+def cause(fault: Fault, robot: CreateBench, session: Session) -> float:
+    """Causes a fault; returns its time, s, host."""
+    now = time.monotonic()
+    if fault.request:
+        robot.robot(**fault.request)
+    elif not fault.sent:
+        robot.whiskers.process.kill()
+        robot.whiskers.process.wait()
+    if fault.sent:
+        now = time.monotonic()
+        os.kill(session.child(fault.child) if fault.child else session.pid, fault.sent)
+    if fault.sent == signal.SIGSTOP and not fault.child:
+        time.sleep(2.0)
+        session.send(signal.SIGCONT)
+    if fault.request == {"do": "unplug"}:
+        session.code()
+        assert fault.sent or "may still roll" in session.output()
+        time.sleep(1.0 if fault.sent else 0.0)
+        assert robot.rolls()
+        now = time.monotonic()
+        robot.robot("plug")
+        until(lambda: robot.state()["mode"] == "PASSIVE", "the watchdog ends the interface")
+    return now
 
 
-def check_end(robot: CreateBench, session: Session, outcome: str, seconds: float = 2 * PATIENCE) -> Recording:
-    """The recording of a session that ends by itself, within some seconds, with an outcome."""
-    code = session.code(seconds)
-    report = session.report()
-    assert report["outcome"] == outcome, session.output()
-    assert code == {"complete": 0, "interrupted": 130}.get(outcome, 2)
-    assert "Traceback" not in session.output(), session.output()
-    robot.stopped_after(0.0)
-    recording = Recording(session.directory / "session.mcap")
-    assert not recording.truncated
-    assert recording.length == report["reports"]
-    return recording
+UNSEEN = {"unplugged", "killed emulator"}
+"""Faults after which the session cannot know that the robot stands."""
 
 
-def test_a_session_is_repeated_to_the_bit(robot: CreateBench, server: SessionServer, tmp_path: Path) -> None:
-    plan = {"arena": {"side": 1.25}, "seed": 7, "reports": 6}
-    live = robot.live(**SLACK, plan=plan) | {"head": {"address": robot.host, "silence": 5.0}}
+@pytest.mark.parametrize("name", QUICK)
+def test_a_fault_stops_the_robot(robot: CreateBench, name: str) -> None:
+    fault = FAULTS[name]
+    with robot.rolling() as session:
+        cause(fault, robot, session)
+        if not fault.outcome:
+            robot.stopped_after()
+            session.code()
+            assert Recording(session.directory / "session.mcap").length is not None
+            return
+        recording = robot.ended(session, fault.outcome)
+        assert session.report()["standing"] == (name not in UNSEEN)
+        if name == "bumper stuck":  # the motion is followed by BACK, as for any contact of the body
+            ends = [(sample.reading.motion, sample.reading.moment) for sample in recording]
+            bump = ends.index((MotionKind.FORWARD, StepEnd.ABORT))
+            assert ends[bump + 1] == (MotionKind.BACK, StepEnd.FREE)
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=IN_TIME) for name in FAULTS])
+def test_a_fault_stops_the_robot_in_time(robot: CreateBench, tmp_path: Path, name: str) -> None:
+    fault = FAULTS[name]
+    with usual_session(robot, minutes=2) as session:
+        session.until(lambda: robot.rolls() and robot.state()["travelled"] > 0.08, "three steps")
+        moment = cause(fault, robot, session)
+        took = robot.stopped_after(moment) if robot.runs() else np.inf
+        if fault.outcome:
+            session.ends(fault.outcome)
+        else:
+            until(lambda: not session.lives(), "its mapper ends")
+        check_replay(session, tmp_path / "again", whole=name != "killed mapper")
+    print(f"\n{name:<30} {fault.outcome or 'killed':<16} stood after {took:.3f} s, limit {fault.limit:.1f} s")
+    assert took <= fault.limit
+
+
+def usual_session(robot: CreateBench, **duration: float) -> AbstractContextManager[Session]:
+    """A session of a new robot, with its own mapper and the usual time limits, except that emulated whiskers
+    may be late."""
+    robot.close()
+    robot.ready()
+    live = robot.live(silence=1.0, plan={**PLAN, **duration})
+    return robot.session(live, rate_check=True, session={"precision": "float32"})
+
+
+def check_replay(session: Session, again: Path, *, whole: bool) -> None:
+    """Maps the recording of a session again and compares what both mapped, to the bit.
+
+    Args:
+        whole: whether the mapper mapped everything that was recorded.
+    """
+    run(load_config(session.directory / "config.yaml"), again)
+    for name in SAME[:3]:
+        live, repeated = ((path / name).read_text() for path in (session.directory, again))
+        assert repeated.startswith(live), name
+        assert len(live.splitlines()) > 2
+        assert not whole or live == repeated, name
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1200)
+def test_three_minutes_and_their_replay(robot: CreateBench, tmp_path: Path) -> None:
+    with usual_session(robot, minutes=3) as session:
+        report = session.ends("complete")
+    print(json.dumps(report, indent=1))
+    print((session.directory / "gridscore.json").read_text())
+    assert report["standing"]
+    assert report["head"]["missing"] == 0
+    assert report["ends"]["hit1"] > 5
+    check_replay(session, tmp_path / "again", whole=True)
+    reports = [sample.reading for sample in Recording(session.directory / "session.mcap")]
+    for before, report in itertools.pairwise(reports):
+        assert (len(report.strain) > 0) == (before.moment == StepEnd.HIT1)
+
+
+def test_a_session_is_repeated_to_the_bit(robot: CreateBench, tmp_path: Path) -> None:
+    live = robot.live(**SLACK, plan={"arena": PLAN["arena"], "seed": 7, "reports": 6})
     touch = {"reports": {"walls": "geometric"}}  # no strain templates, whose training takes seconds
-    config = {"live": live, "backend": "grid", "grid": {"particles": 20}, "touch": touch}
-    session = server.start(config, mapper=None)
-    try:
-        recording = check_end(robot, session, "complete", 4 * PATIENCE)
-    finally:
-        session.end()
+    with robot.session(live, grid={"particles": 20}, touch=touch) as session:
+        recording = robot.ended(session, "complete")
     assert session.report()["standing"]
     run(load_config(session.directory / "config.yaml"), tmp_path / "again")
     for name in SAME:
@@ -89,87 +188,35 @@ def test_a_session_is_repeated_to_the_bit(robot: CreateBench, server: SessionSer
     odometry = [sample.reading.odometry for sample in recording]
     assert len(odometry) == 6
     assert 0.08 < sum(step.dx for step in odometry) < 0.4  # steps of 25 mm, more on a busy machine
-    times = [sample.time for sample in recording]
-    assert np.allclose(times, np.cumsum([step.dt for step in odometry]))
+    assert np.allclose([sample.time for sample in recording], np.cumsum([step.dt for step in odometry]))
 
 
-def test_a_bumper_that_stays_pressed(robot: CreateBench, server: SessionServer) -> None:
-    """The motion is aborted and followed by BACK, as for any contact of the body; the session then ends."""
-    with rolling(robot, server) as session:
-        robot.robot("bump")
-        recording = check_end(robot, session, "bumper_stuck")
-    ends = [(sample.reading.motion, sample.reading.moment) for sample in recording]
-    bump = ends.index((MotionKind.FORWARD, StepEnd.ABORT))
-    assert ends[bump + 1] == (MotionKind.BACK, StepEnd.FREE)
-    assert session.report()["standing"]
-
-
-def test_a_lifted_wheel_and_an_interrupt(robot: CreateBench, server: SessionServer) -> None:
-    with rolling(robot, server) as session:
-        robot.robot("drop")
-        check_end(robot, session, "wheel_drop")
-    robot.robot("clear")
-    with rolling(robot, server) as session:
-        session.process.send_signal(signal.SIGINT)
-        check_end(robot, session, "interrupted")
-        assert session.report()["standing"]
-
-
-def test_whiskers_that_are_unplugged_are_awaited(robot: CreateBench, server: SessionServer) -> None:
+def test_whiskers_that_are_unplugged_are_awaited(robot: CreateBench) -> None:
     """The robot stands meanwhile; the motion so far is recorded without a touch."""
-    with rolling(robot, server) as session:
+    with robot.rolling() as session:
         robot.whiskers(do="unplug")
         until(lambda: not robot.rolls(), "the robot stands")
         robot.whiskers(do="plug")
         until(robot.rolls, "the robot goes on")
-        session.process.send_signal(signal.SIGINT)
-        recording = check_end(robot, session, "interrupted")
+        session.send(signal.SIGINT)
+        recording = robot.ended(session, "interrupted")
     unsampled = [sample.reading for sample in recording if not sample.reading.alive.any()]
     assert 1 <= len(unsampled) <= 2  # the motion that Ctrl-C ends at once may have no sample either
     assert not any(reading.contact.any() for reading in unsampled)
     assert [event.name for event in recording.events][:2] == ["held", "resumed"]
 
 
-def test_the_self_test_moves_nothing(robot: CreateBench, tmp_path: Path, monkeypatch: Any) -> None:
+def test_the_self_test_moves_nothing(robot: CreateBench, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("robot.live.selftest.LISTEN_TIME", 0.3)
     monkeypatch.setattr("robot.live.selftest.MIN_RATE_SHARE", 0.0)
-    before = robot.state()
-    lines = list(
-        check_session(LiveConfig.model_validate(robot.live(**SLACK)), HeadConfig(), tmp_path / "run")
-    )
+    live, before = LiveConfig.model_validate(robot.live(**SLACK)), robot.state()
+    text = "\n".join(check_session(live, HeadConfig(), tmp_path / "run"))
     until(lambda: robot.state()["mode"] == "PASSIVE", "the robot is passive again")
     after = robot.state()
     assert (before["x"], before["y"], before["speeds"]) == (after["x"], after["y"], after["speeds"])
-    text = "\n".join(lines)
     for part in ("disk: ", "can be opened", "4 whiskers at 2000 Hz", "safe mode", "4 of 4 alive", "clocks: "):
         assert part in text
     robot.robot("bump")
     with pytest.raises(InputError, match="left pressed"):
-        list(check_session(LiveConfig.model_validate(robot.live(**SLACK)), HeadConfig(), tmp_path / "run"))
+        list(check_session(live, HeadConfig(), tmp_path / "run"))
     assert not (tmp_path / "run").exists()
-
-
-def test_unplugged_and_plugged_in_again(robot: CreateBench, server: SessionServer) -> None:
-    with rolling(robot, server) as session:
-        robot.robot("unplug")
-        assert session.code() == 2
-        assert session.report()["outcome"] == "link_lost"
-        assert not session.report()["standing"]
-        assert "may still roll" in session.output()
-        assert robot.rolls()
-        robot.robot("plug")
-        until(lambda: robot.state()["mode"] == "PASSIVE", "the watchdog ends the interface")
-        assert not robot.rolls()
-
-
-def test_killed_processes(robot: CreateBench, server: SessionServer) -> None:
-    with rolling(robot, server) as session:
-        kill(session.mapper(), signal.SIGKILL)
-        check_end(robot, session, "mapper_gone")
-    with rolling(robot, server) as session:
-        kill(child_of(session.process.pid, b"robot.drivers.create.watchdog"), signal.SIGKILL)
-        check_end(robot, session, "watchdog_gone")
-    with rolling(robot, server) as session:
-        session.process.kill()
-        robot.stopped_after(0.0)
-    assert Recording(session.directory / "session.mcap").length is not None

@@ -1,11 +1,16 @@
-"""A live session is read back exactly; invalid messages and cuts are refused."""
+"""Live recordings are read back exactly: laws, kills, full disks, recovery, damage."""
 
 from __future__ import annotations
 
+import re
+import resource
+import signal
 import struct
+import subprocess
 import sys
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,21 +21,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.drivers.head.decoder import MAX_FRAMES, Cut, Frames, FrameWindow, assemble_cycle
+from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.shared_state import ARM_STATE
-from robot.live.recorder import LiveRecorder
 from robot.recordings.cdr import TRUTH, Event, decode, encode
-from robot.recordings.mcap_reader import McapScanner, Recording
-from robot.recordings.mcap_writer import Recorder
-from robot.sources.source import SourceDescription
+from robot.recordings.mcap_reader import UNCLOSED, McapScanner, Recording
+from robot.recordings.mcap_writer import WholeChunkFile, recover
+from robot.sources.source import Sample
 from tactile.base.errors import InputError
-from tactile.base.types import Cycle
+from tests.helpers.live import ROOT
 from tests.robot.live.live_recordings import (
     INFO,
     RATE,
     START,
     W,
     content,
-    entries_of,
+    cut_of,
     motion_of_whisk,
     open_recorder,
     rows,
@@ -38,11 +43,12 @@ from tests.robot.live.live_recordings import (
     session,
     some_frames,
     some_states,
+    whole,
 )
 
 
 def test_a_session_is_read_back_exactly(tmp_path: Path) -> None:
-    cycles, frames, _ = session(tmp_path / "a.mcap")
+    cycles, frames = session(tmp_path / "a.mcap")
     recording = Recording(tmp_path / "a.mcap")
     samples = list(recording)
     assert all(same_bits(sample.reading, cycle) for sample, cycle in zip(samples, cycles, strict=True))
@@ -58,21 +64,20 @@ def test_a_session_is_read_back_exactly(tmp_path: Path) -> None:
     assert cycles[1].deflection.shape == (0, W, 2)
     # The frames of a dropped image are recorded too.
     parts = content(tmp_path / "a.mcap", Frames)
-    assert same_bits(Frames(*(np.concatenate(part) for part in zip(*parts, strict=True))), frames)
+    assert same_bits(whole(parts), frames)
 
 
 def test_a_whisk_is_assembled_from_its_frames() -> None:
     frames = some_frames(10, first=90)
-    cycle = assemble_cycle(frames, Cut.of(0, 3.0, 2.5, rows(frames, slice(2, 7)), motion_of_whisk(0)))
+    cut = Cut.of(0, 3.0, 2.5, rows(frames, slice(2, 7)), motion_of_whisk(0))
+    cycle = assemble_cycle(frames, cut)
     np.testing.assert_allclose(cycle.time, 2.5 + np.arange(5) / RATE, rtol=0, atol=1e-12)
     np.testing.assert_allclose(cycle.angle, frames.values[2:7, :, 0] * np.pi / 32768)
     np.testing.assert_allclose(cycle.deflection, frames.values[2:7, :, 1:] * np.pi / 32768)
     assert cycle.odometry == motion_of_whisk(0)
     assert all(part.flags.c_contiguous for part in cycle[:3])
     mixed = rows(frames, np.random.default_rng(0).permutation(10))
-    assert same_bits(
-        assemble_cycle(mixed, Cut.of(0, 3.0, 2.5, rows(frames, slice(2, 7)), motion_of_whisk(0))), cycle
-    )
+    assert same_bits(assemble_cycle(mixed, cut), cycle)
 
 
 @settings(max_examples=40)
@@ -93,26 +98,22 @@ def test_the_order_of_frames_does_not_matter(tmp_path_factory: Any, data: st.Dat
             ahead = rows(came, slice(0, at + step))  # the ring buffer has frames before the recorder
             first = int(frames.sequence[0]) + data.draw(st.integers(-5, 120)) if count else 0
             mine = ahead.select(first, first + data.draw(st.integers(0, 60)))
-            cut = Cut.of(
-                len(cycles), START + at, START, mine, motion_of_whisk(at), seen=data.draw(st.booleans())
-            )
+            cut = cut_of(len(cycles), mine, START + at, seen=data.draw(st.booleans()))
             early = data.draw(st.booleans())
-            if early:
-                recorder.add_whisk(cut, mine)
-            recorder.add_frames(block, START + 0.01 * at)
-            if not early:
-                recorder.add_whisk(cut, mine)
+            for whisk in (early, not early):
+                if whisk:
+                    recorder.add_whisk(cut, mine)
+                else:
+                    recorder.add_frames(block, START + 0.01 * at)
             cycles.append(assemble_cycle(mine, cut))
             at += step
             if at >= len(order):
                 break
-    scanner = McapScanner(path)
-    entries = list(scanner.entries())
-    assert not scanner.broken
-    samples = [entry.content for entry in entries if hasattr(entry.content, "reading")]
+    samples = content(path, Sample)
     assert all(same_bits(sample.reading, cycle) for sample, cycle in zip(samples, cycles, strict=True))
-    numbers = [entry.content.sequence for entry in entries if isinstance(entry.content, Frames)]
-    assert sorted(np.concatenate([np.zeros(0, int), *numbers])) == sorted(came.sequence)  # each once
+    numbers = whole([Frames.blank(W), *content(path, Frames)]).sequence
+    assert sorted(numbers) == sorted(came.sequence)  # each once
+    assert not Recording(path).truncated
 
 
 @given(st.integers(0, 40), st.integers(0, 5), st.integers(0, 2**32))
@@ -140,21 +141,16 @@ def back(content: Any) -> tuple[float, Any]:
 @given(st.binary(max_size=120), st.sampled_from([0, 1, 2, 3]), st.integers(0, 400), st.integers(0, 2**32 - 1))
 def test_invalid_messages_are_refused(noise: bytes, kind: int, place: int, number: int) -> None:
     frames = some_frames(3)
-    cut = Cut.of(0, 1.0, 1.0, frames, motion_of_whisk(0))
+    cut = cut_of(0, frames)
     name, _, good = encode((frames, some_states(2), cut, Event(1.0, "a", "b"))[kind], (2, 2, 1), W, 1.0)
     place = place % len(good)
-    for bad in (
-        noise,
-        b"\0\1\0\0" + noise,
-        good[:place],
-        good[:place] + struct.pack("<I", number) + good[place + 4 :],
-    ):
+    changed = good[:place] + struct.pack("<I", number) + good[place + 4 :]
+    for bad in (noise, b"\0\1\0\0" + noise, good[:place], changed):
         with suppress(ValueError):
             decode(name, bad, (2, 2, 1), W)
-    with pytest.raises(ValueError):
-        decode(name, good[: max(place, 1) - 1], (2, 2, 1), W)
-    with pytest.raises(ValueError):
-        decode(name, good + b"\0", (2, 2, 1), W)
+    for bad in (good[: max(place, 1) - 1], good + b"\0"):
+        with pytest.raises(ValueError):
+            decode(name, bad, (2, 2, 1), W)
 
 
 def test_data_are_written_within_a_fifth_of_a_second(tmp_path: Path) -> None:
@@ -174,14 +170,14 @@ def test_data_are_written_within_a_fifth_of_a_second(tmp_path: Path) -> None:
     assert max(late) / RATE < 0.2
     assert len(content(path, Frames)) >= 5  # in blocks, not one by one
     mine = rows(frames, slice(0, RATE))
-    recorder.add_whisk(Cut.of(0, START + 1.0, START, mine, motion_of_whisk(0)), mine)
+    recorder.add_whisk(cut_of(0, mine, START + 1.0), mine)
     assert McapScanner(path).__iter__().__next__().reading.angle.shape == (RATE, W)
     recorder.close()
 
 
 def test_a_cut_must_match_its_frames(tmp_path: Path) -> None:
     frames, recorder = some_frames(20), open_recorder(tmp_path / "a.mcap")
-    cut = Cut.of(0, START, START, frames, motion_of_whisk(0))
+    cut = cut_of(0, frames)
     for wrong in (cut._replace(frames=19), cut._replace(first=1), cut._replace(frames=0, first=50, last=60)):
         with pytest.raises(ValueError, match="frames for a whisk"):
             recorder.add_whisk(wrong, frames)
@@ -204,7 +200,7 @@ def test_a_cut_without_its_frames_is_an_error(tmp_path: Path, monkeypatch: pytes
             ),
         )
         frames = some_frames(20)
-        recorder.add_whisk(Cut.of(0, START, START, frames, motion_of_whisk(0)), frames)
+        recorder.add_whisk(cut_of(0, frames), frames)
     scanner = McapScanner(tmp_path / "a.mcap")
     assert list(scanner) == []
     assert scanner.broken == "a whisk of 21 frames, of which 20 are present"
@@ -238,7 +234,7 @@ def test_three_threads_write_one_recording(tmp_path: Path) -> None:
     def loop() -> None:
         for k in range(4):
             mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
-            recorder.add_whisk(Cut.of(k, START + k, START + k, mine, motion_of_whisk(k)), mine)
+            recorder.add_whisk(cut_of(k, mine), mine)
 
     threads = [threading.Thread(target=target) for target in (head, arm, loop)]
     interval = sys.getswitchinterval()
@@ -251,21 +247,17 @@ def test_three_threads_write_one_recording(tmp_path: Path) -> None:
     finally:
         sys.setswitchinterval(interval)
     recorder.close()
-    scanner = McapScanner(tmp_path / "a.mcap")
-    entries = list(scanner.entries())
-    assert not scanner.broken
-    numbers = np.concatenate([e.content.sequence for e in entries if isinstance(e.content, Frames)])
-    assert (np.sort(numbers) == frames.sequence).all()
-    hosts = np.concatenate([e.content["host"] for e in entries if isinstance(e.content, np.ndarray)])
-    assert (hosts == states["host"]).all()
-    assert scanner.count == 4
+    path = tmp_path / "a.mcap"
+    assert (np.sort(whole(content(path, Frames)).sequence) == frames.sequence).all()
+    assert (np.concatenate(content(path, np.ndarray))["host"] == states["host"]).all()
+    assert (Recording(path).length, Recording(path).truncated) == (4, False)
 
 
 def test_rosbags_reads_a_live_recording(tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader
 
     session(tmp_path / "a.mcap")
-    entries = entries_of(tmp_path / "a.mcap")
+    entries = list(McapScanner(tmp_path / "a.mcap").entries())
     written = [(entry.name, entry.message) for entry in entries]
     written += [(TRUTH, entry.truth) for entry in entries if entry.truth is not None]
     with AnyReader([tmp_path / "a.mcap"]) as reader:
@@ -275,17 +267,196 @@ def test_rosbags_reads_a_live_recording(tmp_path: Path) -> None:
             assert bytes(reader.typestore.serialize_cdr(reader.deserialize(data, name), name)) == data
 
 
-def test_an_unseen_cut_needs_no_frames(tmp_path: Path, refused: Callable[..., InputError]) -> None:
-    with open_recorder(tmp_path / "a.mcap") as recorder:
-        cut = Cut.of(0, START, START, Frames.blank(W), motion_of_whisk(0))
-        assert not cut.seen
-        recorder.add_whisk(cut, Frames.blank(W))
-    (sample,) = Recording(tmp_path / "a.mcap")
-    assert isinstance(sample.reading, Cycle)
-    assert len(sample.reading.time) == 0
-    assert sample.reading.odometry == motion_of_whisk(0)
-    assert isinstance(cut, Cut)
-    refused(
-        lambda: LiveRecorder(Recorder(tmp_path / "a.mcap", SourceDescription((1, 1, 1), 1, info=INFO))),
-        "exists already",
-    )
+WRITER = """
+import mmap, struct, sys
+from pathlib import Path
+from tests.robot.live.live_recordings import cut_of, open_recorder, rows, some_frames
+
+path, beside = map(Path, sys.argv[1:])
+recorder, pool = open_recorder(path), some_frames(2000)
+with beside.open("r+b") as file:
+    counters = mmap.mmap(file.fileno(), 16)
+k = 0
+while True:
+    frames = pool._replace(sequence=pool.sequence + k // 100 * 2000)
+    recorder.add_frames(rows(frames, slice(20 * (k % 100), 20 * (k % 100) + 20)), 0.01 * k)
+    if k % 100 == 99:
+        recorder.add_whisk(cut_of(k // 100, frames, 0.01 * k), frames)
+    k += 1
+    counters[:16] = struct.pack("<qq", k, k // 100)
+"""
+CHUNK = b"\x28\xb5\x2f\xfd"
+"""Begin of a chunk's content."""
+CHUNK_HEADER = 1 + 8 + 3 * 8 + 4 + 8 + 8
+"""Bytes from a chunk's beginning to its content."""
+
+
+def check_loss(folder: Path, seconds: float) -> None:
+    """Kills a recording process some seconds after its first block."""
+    path, beside = folder / f"{seconds}.mcap", folder / f"{seconds}.bin"
+    beside.write_bytes(bytes(16))
+    process = subprocess.Popen([sys.executable, "-c", WRITER, path, beside], cwd=ROOT)
+    try:
+        patience = time.monotonic() + 60
+        while not beside.read_bytes()[0] and time.monotonic() < patience:
+            time.sleep(0.01)
+        time.sleep(seconds)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait(60)
+    blocks, whisks = struct.unpack("<qq", beside.read_bytes())
+    scanner = McapScanner(path)
+    frames = whole([e.content for e in scanner.entries() if isinstance(e.content, Frames)]).sequence
+    assert frames.tolist() == list(range(len(frames)))
+    assert blocks > 20
+    assert blocks - len(frames) / 20 <= 20  # 0.2 s of the session
+    assert whisks <= scanner.count <= whisks + 1
+    assert scanner.broken in (UNCLOSED, "it ends too early")  # killed between two writes, or within one
+
+
+def test_a_killed_session_loses_less_than_a_fifth_of_a_second(tmp_path: Path) -> None:
+    for seconds in (0.02, 0.3):
+        check_loss(tmp_path, seconds)
+
+
+@pytest.mark.soak
+def test_many_killed_sessions(tmp_path: Path) -> None:
+    for seconds in np.random.default_rng(1).uniform(0, 1, 50):
+        check_loss(tmp_path, float(seconds))
+
+
+def test_a_full_disk_is_a_fault_and_the_recording_stays_readable(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    frames, recorder = some_frames(6 * RATE), open_recorder(path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+        sizes = []
+        for k in range(6 * RATE // 4):
+            recorder.add_frames(rows(frames, slice(4 * k, 4 * k + 4)), START + 4 * k / RATE)
+            if k % 50 == 49:
+                mine = rows(frames, slice(4 * k - RATE + 4, 4 * k + 4))
+                recorder.add_whisk(cut_of(k, mine), mine)
+            sizes.append(path.stat().st_size)
+        fault = recorder.fault
+        recorder.add_event(START, "late", "after the fault")
+        recorder.close()
+        recorder.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert fault is not None
+    assert fault is recorder.fault
+    assert fault.outcome is SessionOutcome.DISK_FULL
+    assert str(path) in fault.detail
+    assert "free space" in fault.detail
+    assert max(sizes) < 20_000  # an incomplete chunk is truncated
+    recording = Recording(path)
+    assert recording.truncated
+    assert 1 <= recording.length == len(list(recording)) < 6
+    assert recover(path, tmp_path / "b.mcap")[0] == recording.length
+
+
+def test_a_disk_that_was_full_yields_a_complete_file_in_the_end(tmp_path: Path, monkeypatch) -> None:
+    def no_room(_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "a.mcap"
+    frames, recorder = some_frames(3 * RATE), open_recorder(path)
+    with monkeypatch.context() as patch:
+        for k in range(3):
+            mine = rows(frames, slice(k * RATE, (k + 1) * RATE))
+            if k == 1:
+                patch.setattr(WholeChunkFile, "flush", no_room)
+            recorder.add_whisk(cut_of(k, mine), mine)
+    assert recorder.fault is not None
+    recorder.close()
+    recording = Recording(path)
+    assert (recording.length, recording.truncated) == (1, False)
+
+
+def read(path: Path) -> tuple[list[Any], str]:
+    """What can be read of a recording, and why it ends."""
+    scanner = McapScanner(path)
+    return [entry[:4] for entry in scanner.entries()], scanner.broken
+
+
+def test_recover_keeps_messages_other_than_samples(tmp_path: Path) -> None:
+    cut, good = tmp_path / "cut.mcap", tmp_path / "good.mcap"
+    session(tmp_path / "whole.mcap")
+    data = (tmp_path / "whole.mcap").read_bytes()
+    cut.write_bytes(data[: data.rindex(CHUNK)])  # in its last chunk
+    before, end = read(cut)
+    assert recover(cut, good) == (3, "it ends too early") == (3, end)
+    assert read(good) == (before, "")
+    again = Recording(good)
+    assert not again.truncated
+    assert [event.name for event in again.events] == ["start"]
+    assert len({type(entry.content) for entry in McapScanner(good).entries()}) == 4
+
+
+def test_a_recording_without_a_whisk_is_not_recovered(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with open_recorder(path) as recorder:
+        recorder.add_frames(some_frames(5), START)
+    for action in (lambda: recover(path, tmp_path / "b.mcap"), lambda: Recording(path)):
+        with pytest.raises(InputError, match="holds no samples"):
+            action()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def damaged_copies(data: bytes, seed: int, rounds: int) -> Iterator[bytes]:
+    random = np.random.default_rng(seed)
+    for _ in range(rounds):
+        bad = bytearray(data)
+        for place in random.integers(0, len(bad), random.integers(1, 4)):
+            match int(random.integers(4)):
+                case 0:
+                    bad[place % len(bad)] ^= 1 << int(random.integers(8))
+                case 1:
+                    bad[place : place + int(random.integers(1, 4000))] = b""
+                case 2:
+                    bad[place : place + 16] = bytes(16)
+                case _:
+                    del bad[place:]
+        yield bytes(bad)
+
+
+@pytest.mark.parametrize("rounds", [150, pytest.param(5000, marks=pytest.mark.soak)])
+def test_a_prefix_of_a_damaged_file_is_read(tmp_path: Path, rounds: int) -> None:
+    path, bad = tmp_path / "a.mcap", tmp_path / "bad.mcap"
+    session(path, whisks=2)
+    whole, lengths = read(path)[0], set()
+    for data in damaged_copies(path.read_bytes(), rounds, rounds):
+        bad.write_bytes(data)
+        found, broken = read(bad)
+        assert found == whole[: len(found)]
+        assert broken or len(found) == len(whole)
+        lengths.add(len(found))
+    assert len(lengths) > 5
+
+
+@pytest.mark.parametrize("unsigned", [False, True])
+@pytest.mark.parametrize("only", [False, True])
+def test_a_skipped_chunk_is_reported(tmp_path: Path, unsigned: bool, only: bool) -> None:
+    """The chunk's type is damaged; `unsigned` also sets the file's checksum to 0 (absent); an only chunk
+    holds the channel too."""
+    path = tmp_path / "a.mcap"
+    if only:
+        with open_recorder(path) as recorder:
+            recorder.add_event(START, "start", "and end")
+    else:
+        session(path, whisks=2)
+    whole, data = read(path)[0], path.read_bytes()
+    chunks = [found.start() - CHUNK_HEADER for found in re.finditer(re.escape(CHUNK), data)]
+    assert len(chunks) == 1 if only else len(chunks) > 10
+    for chunk in chunks:
+        assert data[chunk] == 6
+        bad = bytearray(data)
+        bad[chunk] = 0x7F
+        if unsigned:
+            end = data.index(b"\x0f" + struct.pack("<Q", 4), chunks[-1])
+            bad[end + 9 : end + 13] = bytes(4)
+        path.write_bytes(bad)
+        found, broken = read(path)
+        assert found == whole[: len(found)]
+        assert broken

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -32,33 +31,37 @@ ROOM = Arena("room", CORNERS, (), np.array([1.0, 1.0, 0.0]))
 BODY = 0.17
 
 
+EXACT = CreateWorldConfig(wheels=WheelsConfig(noise="none"))
+
+
 def robot_in(world: CreateWorldConfig, arena: Arena = ROOM, seed: int = 0) -> EmulatedCreate:
     robot = EmulatedCreate(CreateEmulatorConfig(world=world, seed=seed), arena)
     robot.receive(START + SAFE)
     return robot
 
 
-def test_a_wall_stops_the_body_and_presses_the_bumper() -> None:
-    robot = robot_in(CreateWorldConfig(wheels=WheelsConfig(noise="none")))
-    robot.receive(drive(200, 200))
-    robot.advance(5.0)
+def move(robot: EmulatedCreate, right: int, left: int, seconds: float) -> None:
+    """Turns the wheels for some seconds, mm/s."""
+    robot.receive(drive(right, left))
+    robot.advance(seconds)
+
+
+def test_a_wall_stops_the_body_and_presses_the_bumper_while_the_wheels_slip() -> None:
+    robot = robot_in(EXACT)
+    move(robot, 200, 200, 10.0)
     assert robot.base.x == pytest.approx(2.0 - BODY, abs=0.003)
     assert robot.bumps == Bumps.BUMPED
-    robot.receive(drive(0, 0))
-    robot.advance(1.0)
+    assert REPLY.unpack(robot.receive(QUERY)[0])[0] == pytest.approx(2000, abs=1)
+    move(robot, 0, 0, 1.0)
     assert robot.bumps == Bumps.BUMPED  # still against the wall
-    robot.receive(drive(-200, -200))
-    robot.advance(0.5)
+    before = robot.base.heading
+    move(robot, 100, -100, 1.0)
+    assert robot.base.heading - before == pytest.approx(0.2 / 0.258), "turns are not blocked"
+    assert robot.base.x == pytest.approx(2.0 - BODY, abs=0.003)
+    move(robot, -100, 100, 1.0)
+    move(robot, -200, -200, 0.5)
     assert robot.bumps == 0
     assert robot.base.x == pytest.approx(2.0 - BODY - 0.1, abs=0.005)
-
-
-def test_the_wheels_slip_unnoticed() -> None:
-    robot = robot_in(CreateWorldConfig(wheels=WheelsConfig(noise="none")))
-    robot.receive(drive(200, 200))
-    robot.advance(10.0)
-    (reply,) = robot.receive(QUERY)
-    assert REPLY.unpack(reply)[0] == pytest.approx(2000, abs=1)
 
 
 def test_odometry_has_one_error_for_the_whole_session() -> None:
@@ -67,8 +70,7 @@ def test_odometry_has_one_error_for_the_whole_session() -> None:
     for seed in range(12):
         robot = robot_in(CreateWorldConfig(wheels=WheelsConfig(noise="bias", level=0.05)), wide, seed)
         for _ in range(5):
-            robot.receive(drive(200, 200))
-            robot.advance(5.0)
+            move(robot, 200, 200, 5.0)
             robot.receive(drive(0, 0))
         measured = REPLY.unpack(robot.receive(QUERY)[0])[0]
         shares.append(measured / (1000 * (robot.base.x - 50.0)))
@@ -118,28 +120,15 @@ def test_rolling_shakes_the_whiskers_and_standing_does_not() -> None:
 def test_a_file_is_not_replaced_by_the_link_of_the_port(tmp_path: Path) -> None:
     pytest.importorskip("termios", reason="needs pseudo-terminals")
     name = tmp_path / "create.tty"
-    name.write_text("mine")
-    with pytest.raises(InputError, match="is no emulated port"):
-        Terminal(str(name))
-    assert name.read_text() == "mine"
-    name.unlink()
-    name.symlink_to("/etc/hostname")
-    with pytest.raises(InputError, match="is no emulated port"):
-        Terminal(str(name))
-    name.unlink()
+    for make in (lambda: name.write_text("mine"), lambda: name.symlink_to("/etc/hostname")):
+        make()
+        before = name.read_text()
+        with pytest.raises(InputError, match="is no emulated port"):
+            Terminal(str(name))
+        assert name.read_text() == before
+        name.unlink()
     name.symlink_to("/dev/pts/none")  # left by an emulator that was killed
     terminal = Terminal(str(name))
     assert name.resolve().exists()
     terminal.unplug()
     assert not name.is_symlink()
-
-
-def test_turns_are_not_blocked_at_a_wall() -> None:
-    robot = robot_in(CreateWorldConfig(wheels=WheelsConfig(noise="none")))
-    robot.receive(drive(200, 200))
-    robot.advance(5.0)
-    robot.receive(drive(100, -100))
-    before = robot.base.heading
-    robot.advance(1.0)
-    assert robot.base.heading - before == pytest.approx(0.2 / 0.258)
-    assert math.isclose(robot.base.x, 2.0 - BODY, abs_tol=0.003)

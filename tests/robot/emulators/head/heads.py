@@ -8,16 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from robot.drivers.head import usb_protocol as wire
 from robot.drivers.head.decoder import Decoder, Frames
-from robot.drivers.head.usb_protocol import (
-    KEEP_ALIVE,
-    REQUEST_OUT,
-    Command,
-    CommandKind,
-    FeedbackMode,
-    Request,
-    to_counts,
-)
+from robot.drivers.head.usb_protocol import Command, CommandKind, FeedbackMode
 from robot.emulators.head.emulated_device import EmulatedHead
 from robot.emulators.head.emulator_config import CONTROL_PORT, HeadEmulatorConfig
 from robot.emulators.head.whiskers import BLOCK, AlongPath, PoseSource, Whiskers
@@ -28,15 +21,18 @@ from tests.helpers.live import Faults, emulator
 
 TABLE = Walls(np.array([[-9.0, -9.0, 9.0, 9.0]]), np.array([0.05]))
 """A plate under the head, 5 cm high: every whisker touches it with its tip."""
-EVER = 10**9
-"""Read size above any number of queued bytes."""
 
 
 def drive(mode: FeedbackMode = FeedbackMode.RCP, threshold: float = 0.04, **changes: Any) -> Command:
     """A whisk with the paper's settings."""
-    numbers = np.full(18, to_counts(np.array(threshold)))
+    numbers = np.full(18, wire.to_counts(np.array(threshold)))
     usual = {"amplitude": np.radians(65), "frequency": 1.0, "gain": 4.0, "window": 0.01}
     return Command(CommandKind.DRIVE, mode, numbers=numbers, **usual | changes)
+
+
+def open_drive(**changes: Any) -> Command:
+    """A whisk without feedback."""
+    return drive(FeedbackMode.OPEN, **changes)
 
 
 def world(config: HeadEmulatorConfig) -> Scene:
@@ -52,15 +48,22 @@ class HostedHead:
     def __init__(
         self, config: HeadEmulatorConfig | None = None, walls: Walls = TABLE, place: PoseSource | None = None
     ) -> None:
-        self.config = HeadEmulatorConfig() if config is None else config
+        self.config = config or HeadEmulatorConfig()
         here = AlongPath(world(self.config).path._replace(time=np.zeros(1), pose=np.zeros((1, 3))))
-        self.whiskers = Whiskers(self.config, walls, here if place is None else place)
+        self.whiskers = Whiskers(self.config, walls, place or here)
         self.bridge = EmulatedHead(self.config, self.whiskers, 0.0)
         self.decoder, self.now = Decoder(self.whiskers.count, 3), 0.0
 
-    def start(self) -> None:
-        """Starts the stream of frames."""
-        self.bridge.control(REQUEST_OUT, Request.START, 0, 0, self.now)
+    def start(self, *commands: Command) -> HostedHead:
+        """Starts the stream of frames and sends commands."""
+        self.bridge.control(wire.REQUEST_OUT, wire.Request.START, 0, 0, self.now)
+        for command in commands:
+            self.send(command)
+        return self
+
+    def stop(self) -> None:
+        """Stops the stream of frames."""
+        self.bridge.control(wire.REQUEST_OUT, wire.Request.STOP, 0, 0, self.now)
 
     def send(self, command: Command) -> None:
         self.bridge.bulk_out(command.pack(), self.now)
@@ -70,16 +73,33 @@ class HostedHead:
         end, got = self.now + seconds, []
         while self.now < end - 1e-9:
             if awake:
-                self.send(KEEP_ALIVE)
+                self.send(wire.KEEP_ALIVE)
             self.now += BLOCK
             while self.bridge.advance(self.now + 1e-6):
                 pass
             if read:
-                got.append(self.bridge.bulk_in(EVER, self.now))
+                got.append(self.read())
         return self.decoder.feed(b"".join(got))
+
+    def read(self, later: float = 0.0) -> bytes:
+        """All bytes that are queued, read some seconds later."""
+        return self.bridge.bulk_in(10**9, self.now + later)
+
+    def angles(self, seconds: float) -> np.ndarray:
+        """Advances time by some seconds; angles [N, whiskers] of the frames read."""
+        return wire.to_radians(self.pass_by(seconds).values)[0]
+
+    def deflections(self, seconds: float) -> np.ndarray:
+        """Advances time by some seconds; deflections [N, whiskers, 2] of the frames read."""
+        return wire.to_radians(self.pass_by(seconds).values)[1]
 
     def do(self, fault: str, **arguments: Any) -> dict[str, Any]:
         return self.bridge.do({"do": fault, **arguments}, self.now)
+
+
+def started(*commands: Command, **settings: Any) -> HostedHead:
+    """A head of these settings above `TABLE` that streams and executes commands."""
+    return HostedHead(HeadEmulatorConfig.model_validate(settings)).start(*commands)
 
 
 def running(config: HeadEmulatorConfig, folder: Path) -> AbstractContextManager[Faults]:

@@ -15,13 +15,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
-from robot.drivers.ur10.rtde_protocol import PoseListener
 from tests.helpers.live import ROOT, Faults, until, ur_emulator
 
 REAL = os.environ.get("RATSLAM_UR_HOST", "")
@@ -46,13 +45,6 @@ class Bench:
         self.faults = self._stack.enter_context(ur_emulator(self.host, START, *arguments))
         return self.faults
 
-    def good(self) -> Faults:
-        """The present emulator with its faults cleared, or a new one if it has ended."""
-        if self.faults is None or self.faults.process.poll() is not None:
-            return self.fresh()
-        self.faults(do="clear")
-        return self.faults
-
     def close(self) -> None:
         self._stack.close()
         self.faults = None
@@ -67,49 +59,49 @@ def bench(loopback: str) -> Iterator[Bench]:
 
 @pytest.fixture
 def faults(bench: Bench) -> Faults:
-    return bench.good()
+    """The present emulator with its faults cleared, or a new one if it has ended."""
+    if bench.faults is None or bench.faults.process.poll() is not None:
+        return bench.fresh()
+    bench.faults(do="clear")
+    return bench.faults
 
 
-@contextmanager
-def client(host: str, scenario: str) -> Iterator[subprocess.Popen[str]]:
-    """A client's process, until the end of the block."""
-    command = [sys.executable, "-m", "tests.robot.emulators.ur10.client", host, scenario]
-    process = subprocess.Popen(
-        command, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+class Client:
+    """A process with the client libraries, until the end of the block."""
+
+    def __init__(self, host: str) -> None:
+        command = [sys.executable, "-m", "tests.robot.emulators.ur10.client", host]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(command, cwd=ROOT, text=True, stdin=pipe, stdout=pipe, bufsize=1)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+    def call(self, part: str, name: str, *arguments: Any, repeat: bool = False) -> Any:
+        """The result of a method of a library's interface."""
+        self.process.stdin.write(json.dumps([part, name, arguments, repeat]) + "\n")
+        return json.loads(self.process.stdout.readline())
+
+    def control(self, name: str, *arguments: Any) -> Any:
+        return self.call("control", name, *arguments)
+
+    def receive(self, name: str) -> Any:
+        return self.call("receive", name)
+
+    def pose(self) -> list[float]:
+        pose: list[float] = self.receive("getActualTCPPose")
+        return pose
 
 
-def wait_for_client(process: subprocess.Popen[str]) -> None:
-    """Waits until a client prints "here"."""
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.strip() == "here":
-            return
-    raise AssertionError(process.communicate()[1])
-
-
-def resume(process: subprocess.Popen[str]) -> None:
-    """Sends the line for which a client waits."""
-    assert process.stdin is not None
-    process.stdin.write("\n")
-    process.stdin.flush()
-
-
-def outcome(process: subprocess.Popen[str]) -> Any:
-    """The result of a client, from its last line."""
-    output, errors = process.communicate("\n", timeout=WAIT)
-    assert process.returncode == 0, errors
-    return json.loads(output.splitlines()[-1])
-
-
-def run_scenario(host: str, scenario: str) -> Any:
-    with client(host, scenario) as process:
-        return outcome(process)
+def control_error(host: str) -> str:
+    """The library's error when control is refused; "" if it is granted."""
+    with Client(host) as client:
+        found = client.control("isConnected")
+        return "" if found is True else str(found["error"])
 
 
 VERSIONS = [
@@ -123,42 +115,76 @@ VERSIONS = [
 @emulated
 @pytest.mark.parametrize(("hz", "polyscope"), VERSIONS)
 def test_all_four_clients_of_ur_rtde_work_with_every_version(bench: Bench, hz: str, polyscope: str) -> None:
-    bench.fresh("--hz", hz, "--polyscope", polyscope)
-    seen = run_scenario(bench.host, "all")
-    assert seen["connected"] == [True] * 3
-    assert seen["program"]
-    assert seen["mode"] == "Robotmode: RUNNING"
-    assert polyscope in seen["version"]
-    assert seen["safety"] == [1, 1]
-    assert seen["lowered"] == pytest.approx(0.1, abs=1e-9)
-    assert seen["reachable"] == [True, False]
-    assert seen["rate"] == pytest.approx(1.0, abs=0.1)
+    faults = bench.fresh("--hz", hz, "--polyscope", polyscope)
+    faults(do="remote", on=False)  # only an e-Series requires remote control
+    assert ("remote control" in control_error(bench.host)) == (hz == "500")
+    faults(do="remote", on=True)
+    with Client(bench.host) as client:
+        assert all(client.call(part, "isConnected") for part in ("receive", "control", "io"))
+        client.call("dashboard", "connect")
+        start, began = client.receive("getTimestamp"), time.monotonic()
+        assert client.control("isProgramRunning")
+        assert client.call("dashboard", "robotmode") == "Robotmode: RUNNING"
+        assert polyscope in client.call("dashboard", "polyscopeVersion")
+        assert [client.receive(f"getSafety{name}") for name in ("Mode", "StatusBits")] == [1, 1]
+        pose = client.pose()
+        assert client.control("isPoseWithinSafetyLimits", pose)
+        assert not client.control("isPoseWithinSafetyLimits", [5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        client.call("io", "setSpeedSlider", 0.25)
+        until(lambda: client.receive("getTargetSpeedFraction") == pytest.approx(0.25), "the slider is set")
+        client.control("setTcp", [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+        until(lambda: pose[2] - client.pose()[2] == pytest.approx(0.1, abs=1e-9), "the tool is lowered")
+
+        def rate() -> float:
+            return (client.receive("getTimestamp") - start) / (time.monotonic() - began)
+
+        # A state can be a second old on a busy machine.
+        until(lambda: time.monotonic() > began + 0.5 and rate() == pytest.approx(1.0, abs=0.1), "a clock")
     bench.close()
 
 
-def test_moves_and_stops(bench: Bench) -> None:
-    if REAL:
-        host = REAL
-    else:
-        bench.good()
-        host = bench.host
-    seen = run_scenario(host, "moves")
-    assert seen["accepted"] == [True] * 2
-    assert seen["seen"] == [True] * 3
-    assert 0.001 < seen["under_way"] <= seen["stood"] < 0.015
+def test_moves_and_stops(request: pytest.FixtureRequest) -> None:
+    host = REAL or request.getfixturevalue("faults").host
+    with Client(host) as client:
+        home = client.pose()
+        goal = [*home[:2], home[2] + 0.02, *home[3:]]
+
+        def operation(name: str = "operationId") -> Any:
+            return client.control(f"getAsyncOperationProgressEx.{name}")
+
+        def off(pose: list[float]) -> float:
+            return math.dist(client.pose()[:3], pose[:3])
+
+        before = operation()
+        client.control("moveL", goal, 0.01, 0.5, True)
+        until(lambda: operation() != before, "the move is known")
+        time.sleep(0.3)
+        under_way = off(home)
+        client.control("stopL", 2.0)
+        until(
+            lambda: not any(client.receive("getActualTCPSpeed")) and not operation("isAsyncOperationRunning")
+        )
+        assert 0.001 < under_way <= off(home) < 0.015
+        for there in (goal, home):
+            assert client.control("moveL", there, 0.1, 1.0)
+            until(lambda there=there: off(there) < 1e-5, "arrival")
 
 
 @pytest.mark.parametrize("watched", [True, False])
 @emulated
 def test_the_arm_of_a_killed_client_is_stopped_only_by_the_watchdog(faults: Faults, watched: bool) -> None:
     before = faults.state()
-    with client(faults.host, "drive watched" if watched else "drive") as process:
-        wait_for_client(process)
+    with Client(faults.host) as client:
+        x, y, *rest = client.pose()
+        if watched:
+            client.control("setWatchdog", 10)
+        client.control("moveL", [x, y + 0.3, *rest], 0.01, 0.5, True)
+        client.call("control", "kickWatchdog" if watched else "isProgramRunning", repeat=True)
         until(lambda: faults.state()["speed"][1] == pytest.approx(0.01), "the arm moves")
         time.sleep(0.3)
         assert faults.state()["moving"]
-        process.send_signal(signal.SIGKILL)
-        process.wait(WAIT)
+        client.process.send_signal(signal.SIGKILL)
+        client.process.wait(WAIT)
     if watched:
         until(lambda: not faults.state()["moving"], "the arm stands")
     else:
@@ -169,120 +195,42 @@ def test_the_arm_of_a_killed_client_is_stopped_only_by_the_watchdog(faults: Faul
     assert after["targets"][-1]["speed"] == 0.01
 
 
-@emulated
-def test_a_malformed_package_aborts_the_client(faults: Faults) -> None:
-    with client(faults.host, "watch") as process:
-        wait_for_client(process)
-        faults(do="malformed")
-        process.communicate("\n", timeout=WAIT)
-        assert process.returncode == -signal.SIGABRT
+SIGNS: list[tuple[dict[str, Any], Callable[[Client], bool]]] = [
+    ({"do": "nan"}, lambda client: all(map(math.isnan, client.pose()))),
+    ({"do": "freeze"}, lambda client: went(client) < 0.1),
+    ({"do": "stall", "seconds": 1.0}, lambda client: went(client) < 0.1),
+    ({"do": "protective"}, lambda client: client.receive("getSafetyStatusBits") == 1 << 10 | 1 << 2),
+    ({"do": "safeguard"}, lambda client: client.receive("getSafetyStatusBits") == 1 << 10 | 1 << 4),
+    ({"do": "slider", "fraction": 0.1}, lambda client: client.receive("getTargetSpeedFraction") < 0.101),
+    (
+        {"do": "wall", "z": 0.31, "solid": -1, "stiffness": 1e3},
+        lambda client: client.receive("getActualTCPForce")[2] == pytest.approx(10),
+    ),
+]
+
+
+def went(client: Client) -> float:
+    """How far the controller's clock goes in 0.15 s."""
+    start = client.receive("getTimestamp")
+    time.sleep(0.15)
+    return float(client.receive("getTimestamp") - start)
 
 
 @emulated
-@pytest.mark.soak
-def test_a_long_stall_ends_a_controlling_client(faults: Faults) -> None:
-    with client(faults.host, "solve") as process:
-        wait_for_client(process)
-        faults(do="stall", seconds=3.5)
-        process.wait(WAIT)
-        assert process.returncode < 0
-
-
-@emulated
-def test_the_state_rate_can_be_lowered(faults: Faults) -> None:
-    def count_states() -> int:
-        with PoseListener(faults.host) as poses:
-            until(poses.latest)
-            times = set()
-            end = poses.latest().robot_time + 0.5
-            while poses.latest().robot_time < end:
-                times.add(poses.latest().robot_time)
-                time.sleep(0.001)
-        return len(times)
-
-    faults(do="rate", hz=40)
-    assert 15 <= count_states() <= 25
-    faults(do="clear")
-    assert count_states() > 30
-
-
-@emulated
-@pytest.mark.parametrize(
-    ("fault", "sign"),
-    [
-        ({"do": "close"}, lambda seen: not seen["connected"]),
-        ({"do": "nan"}, lambda seen: all(seen["nan"])),
-        ({"do": "freeze"}, lambda seen: seen["went"] < 0.1),
-        ({"do": "stall", "seconds": 1.0}, lambda seen: seen["connected"] and seen["went"] < 0.1),
-        ({"do": "protective"}, lambda seen: seen["bits"] == 1 << 2 | 1 << 10),
-        pytest.param(
-            {"do": "safeguard"}, lambda seen: seen["bits"] == 1 << 4 | 1 << 10, marks=pytest.mark.soak
-        ),
-        ({"do": "slider", "fraction": 0.1}, lambda seen: seen["slider"] == pytest.approx(0.1)),
-        (
-            {"do": "wall", "z": 0.31, "solid": -1, "stiffness": 1e3},
-            lambda seen: seen["force"][2] == pytest.approx(10),
-        ),
-    ],
-    ids=lambda value: value["do"] if isinstance(value, dict) else "",
-)
-def test_a_fault_is_seen_by_the_client(bench: Bench, fault: dict[str, Any], sign: Any) -> None:
-    faults = bench.good()
+def test_a_fault_is_seen_by_the_client_until_it_is_cleared(faults: Faults) -> None:
     faults(do="place", tcp=START)
     faults(do="wall")
-    with client(bench.host, "watch") as process:
-        wait_for_client(process)
-        faults(**fault)
-        resume(process)
-        wait_for_client(process)
-        faults(do="clear")
-        faults(do="wall")
-        during, after = outcome(process)
-    assert sign(during), during
-    assert fault["do"] == "close" or not sign(after), after
-
-
-@emulated
-def test_a_move_without_inverse_kinematics_ends_the_program(faults: Faults) -> None:
-    with client(faults.host, "solve") as process:
-        wait_for_client(process)
-        faults(do="ik_fails")
-        seen = outcome(process)
-    assert seen["before"]
-    assert not seen["after"]
-    assert not seen["moved"]
-    assert faults.state()["runtime"] == "STOPPED"
-
-
-@emulated
-def test_a_function_that_is_not_emulated_returns_false(faults: Faults) -> None:
-    """A new program executes linear moves again."""
-    seen = run_scenario(faults.host, "unsupported move")
-    assert seen == {"moved": False, "stopped": True, "after": False, "again": True}
-
-
-@emulated
-def test_registers_belong_to_one_client(faults: Faults) -> None:
-    seen = run_scenario(faults.host, "two clients")
-    assert "already in use" in seen["error"]
-    assert seen["unharmed"]
-    faults(do="registers")
-    assert "already in use" in run_scenario(faults.host, "control error")["error"]
-    faults(do="clear")
-    assert run_scenario(faults.host, "control error")["error"] == ""
-
-
-@emulated
-def test_an_e_series_requires_remote_control(bench: Bench) -> None:
-    faults = bench.fresh("--hz", "500")
-    faults(do="remote", on=False)
-    assert "remote control" in run_scenario(bench.host, "control error")["error"]
-    bench.close()
-
-
-@emulated
-def test_the_io_client_sets_the_speed_slider(faults: Faults) -> None:
-    assert run_scenario(faults.host, "slide")["seen"]
+    with Client(faults.host) as client:
+        for fault, sign in SIGNS:
+            assert not sign(client), fault
+            faults(**fault)
+            until(lambda sign=sign: sign(client), str(fault))
+            assert client.receive("isConnected")
+            faults(do="clear")
+            faults(do="wall")
+            until(lambda sign=sign: not sign(client), f"{fault} is cleared")
+        faults(do="close")
+        until(lambda: not client.receive("isConnected"), "the connection is closed")
 
 
 @emulated
