@@ -1,14 +1,108 @@
-"""A small recording."""
+"""Samples of all kinds for recordings, and their comparison to the bit; a small recording."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 import pytest
 
-from robot.sources.source import Sample
-from tests.robot.recordings.mcap_samples import (
-    some_samples,
-    write_recording,
+from robot.recordings.mcap_writer import Recorder
+from robot.sources.source import MazeInfo, Sample, SourceDescription, SourceInfo
+from tactile.base.types import Cycle, Odometry, Report, Whisk, observation
+from tactile.calibration import Calibration
+from tactile.whisker_geometry import HeadConfig
+
+SHAPE, WHISKERS = (2, 3, 2), 4
+LIKE = SourceDescription(SHAPE, WHISKERS)
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+"""First bytes of a compressed chunk."""
+INFO = SourceInfo(
+    raw_whiskers=True,
+    head=HeadConfig(rest_deg=74.0),
+    calibration=Calibration(
+        mean=np.zeros((2, 2)),
+        sd=np.array([[1e-3, 0.1], [1e-300, -0.0]]),
+        threshold=np.array([[np.inf, 1 / 3], [0.1, 5e-324]]),
+        free=np.array([0.7, 0.0]),
+        alive=np.array([True, False]),
+        rate=2000.0,
+    ),
+    maze=MazeInfo(text="o---o\n|   |\no---o\n", heights=(0.05, 0.02), seed=3),
+    provenance={"über": None, "numbers": [0.1, -0.0]},
 )
+
+
+def leaves(sample: Sample) -> list[Any]:
+    parts: list[Any] = [np.float64(sample.time), type(sample.reading), sample.truth is None]
+    odometry = sample.reading.odometry
+    rest = sample.reading._replace(odometry=None)
+    return [*parts, *odometry, *(part for part in rest if part is not None), sample.truth]
+
+
+def same_bits(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
+    """Whether two sequences of samples are equal in every bit, shape and dtype."""
+
+    def key(value: Any) -> Any:
+        if isinstance(value, (np.ndarray, np.generic)):
+            return np.asarray(value).tobytes(), np.shape(value), np.asarray(value).dtype
+        return value
+
+    return len(one) == len(other) and all(
+        list(map(key, leaves(a))) == list(map(key, leaves(b))) for a, b in zip(one, other, strict=True)
+    )
+
+
+def write_recording(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
+    path.unlink(missing_ok=True)
+    with Recorder(path, replace(LIKE, rate_hz=2.0, info=INFO), **options) as recorder:
+        for sample in samples:
+            recorder.write(sample)
+    return path
+
+
+def some_samples(count: int, seed: int = 0, extreme: bool = False) -> list[Sample]:
+    """Samples of all kinds, every field filled; extreme: with numbers of any size where none is judged."""
+    rng = np.random.default_rng(seed)
+
+    def numbers(*shape: int) -> np.ndarray:
+        found = np.frombuffer(rng.bytes(8 * int(np.prod(shape))), np.float64).reshape(shape)
+        return np.where(np.isfinite(found), found, -0.0) if extreme else rng.normal(size=shape)
+
+    def flags(*shape: int) -> np.ndarray:
+        return rng.random(shape) < 0.5
+
+    samples = []
+    for i in range(count):
+        odometry = Odometry(*(np.float64(x) for x in (*rng.normal(0, 0.05, 3), 0.5)))
+        truth = rng.normal(0, 0.05, size=3) if i % 3 else None
+        rows = int(rng.integers(6)) if extreme else 3
+        reading: Any
+        if i % 5 == 4:
+            kind = rng.integers(4, size=2).tolist()
+            reading = Report(odometry, *kind, *flags(2, WHISKERS), numbers(rows), numbers(rows, WHISKERS, 2))
+        elif i % 4 == 3:
+            reading = Cycle(numbers(rows), numbers(rows, WHISKERS), numbers(rows, WHISKERS, 2), odometry)
+        elif i % 4 == 2:
+            alive, contact, held = flags(3, WHISKERS)
+            touched, highest, reach = numbers(3, WHISKERS)
+            reading = Whisk(odometry, alive, contact, touched, held, highest, reach)
+        else:
+            label = int(rng.integers(-1, 2**31 - 1)) if extreme else i
+            reading = observation(odometry, rng.random(SHAPE), label=label, whiskers=WHISKERS)
+            alive, contact = flags(2, WHISKERS)
+            reading = reading._replace(point=numbers(WHISKERS, 2), contact=contact, alive=alive)
+            if extreme:
+                wall, view_seen = map(np.bool_, flags(2))
+                reading = reading._replace(
+                    wall=wall, view_seen=view_seen, wall_point=numbers(2), wall_sd=numbers(1)[0],
+                    motion=np.int32(rng.integers(4)),
+                )  # fmt: skip
+        samples.append(Sample(0.5 * i, reading, truth))
+    return samples
 
 
 @pytest.fixture(scope="module")

@@ -5,23 +5,87 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
-from robot.drivers.create.driver import ControlLoop
-from robot.drivers.create.driver_config import CommandRefused, StopReason
-from robot.emulators.create import EmulatedCreate
-from tests.robot.drivers.create.serial_lines import Line
+from robot.drivers.create.driver import PAUSE, ControlLoop
+from robot.drivers.create.driver_config import CommandRefused, CreateConfig, StopReason
+from robot.drivers.create.serial_link import SerialLink
+from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 
 PERIOD = 0.05
 NUMBER = st.one_of(st.floats(-0.3, 0.3), st.floats())
 
 
+class Line:
+    """A serial port in memory: commands reach the robot at once, `mangle` changes its replies.
+
+    Attributes:
+        now: its clock, s; a read that times out advances it.
+    """
+
+    def __init__(self) -> None:
+        self.robot = EmulatedCreate(CreateEmulatorConfig())
+        self.now, self.timeout = 100.0, 0.0
+        self.mangle: Callable[[bytes], bytes] = lambda reply: reply
+        self.gone = False
+        self._waiting = b""
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+        self.robot.advance(seconds)
+
+    def clock(self) -> float:
+        return self.now
+
+    @property
+    def in_waiting(self) -> int:
+        self._attached()
+        return len(self._waiting)
+
+    def read(self, size: int = 1) -> bytes:
+        self._attached()
+        data, self._waiting = self._waiting[:size], self._waiting[size:]
+        if len(data) < size:
+            self.wait(self.timeout or 0.0)
+        return data
+
+    def write(self, data: bytes) -> int:
+        self._attached()
+        for reply in self.robot.receive(data):
+            self._waiting += self.mangle(reply)
+        return len(data)
+
+    def arrive(self, data: bytes) -> None:
+        """Makes bytes arrive without a query."""
+        self._waiting += data
+
+    def close(self) -> None: ...
+
+    def _attached(self) -> None:
+        if self.gone:
+            raise OSError(5, "Input/output error")
+
+    def control_loop(self, **settings: Any) -> ControlLoop:
+        """A control loop of this robot, which is awake and in safe mode."""
+        link = SerialLink(self)
+        for command in (protocol.START, protocol.SAFE):
+            link.send(command)
+            self.wait(PAUSE)
+        link.ask(float("inf"))
+        return ControlLoop(CreateConfig(**settings), link, self.clock)
+
+
 def rolls(robot: EmulatedCreate) -> bool:
     return bool(robot.right or robot.left)
+
+
+def check_stop(loop: ControlLoop, reason: StopReason) -> None:
+    assert loop.active_stop.reason is reason
 
 
 def drive(line: Line, loop: ControlLoop, seconds: float, forward: float, turn: float = 0.0) -> None:
@@ -33,6 +97,16 @@ def drive(line: Line, loop: ControlLoop, seconds: float, forward: float, turn: f
             assert loop.active_stop
         loop.poll()
         line.wait(PERIOD)
+
+
+@pytest.fixture
+def line() -> Line:
+    return Line()
+
+
+@pytest.fixture
+def loop(line: Line) -> ControlLoop:
+    return line.control_loop()
 
 
 @given(st.floats(0.01, 0.5), st.lists(st.tuples(NUMBER, NUMBER), max_size=10))
@@ -48,8 +122,7 @@ def test_speeds_above_the_limit_are_not_sent(cap: float, wanted: list[tuple[floa
     assert all(max(abs(right), abs(left)) <= 1000 * cap + 1e-6 for _, right, left in line.robot.drives)
 
 
-def test_a_command_that_is_not_renewed_ends() -> None:
-    line = Line()
+def test_a_command_that_is_not_renewed_ends(line: Line) -> None:
     loop = line.control_loop(patience=0.5)
     loop.steer(0.1, 0.0)
     rolled = []
@@ -64,15 +137,12 @@ def test_a_command_that_is_not_renewed_ends() -> None:
     assert rolls(line.robot)
 
 
-def test_a_bump_stops_forward_motion_only() -> None:
-    line = Line()
-    loop = line.control_loop()
+def test_a_bump_stops_forward_motion_only(line: Line, loop: ControlLoop) -> None:
     drive(line, loop, 0.5, 0.1)
     line.robot.touch(protocol.Bumps.LEFT)
     loop.poll()
     assert not rolls(line.robot)
-    assert loop.active_stop
-    assert loop.active_stop.reason is StopReason.BUMPED
+    check_stop(loop, StopReason.BUMPED)
     assert "left" in str(loop.active_stop)
     with pytest.raises(CommandRefused, match="bumped"):
         loop.steer(-0.1, 0.0)
@@ -87,14 +157,11 @@ def test_a_bump_stops_forward_motion_only() -> None:
 
 @pytest.mark.parametrize("forward", [0.1, -0.1, 0.0])
 @pytest.mark.parametrize("dropped", [protocol.Bumps.DROPPED_LEFT, protocol.Bumps.DROPPED_CASTER])
-def test_a_dropped_wheel_stops_the_robot_until_it_stands(dropped: protocol.Bumps, forward: float) -> None:
-    line = Line()
-    loop = line.control_loop()
+def test_a_dropped_wheel_stops_the_robot_until_it_stands(dropped, forward, line, loop):
     drive(line, loop, 0.2, forward, 0.2)
     line.robot.touch(dropped)
     drive(line, loop, 0.2, forward, 0.2)
-    assert loop.active_stop
-    assert loop.active_stop.reason is StopReason.WHEEL_DROP
+    check_stop(loop, StopReason.WHEEL_DROP)
     loop.release()
     drive(line, loop, 0.2, forward, 0.2)
     assert loop.active_stop is not None  # the wheel still hangs
@@ -104,14 +171,11 @@ def test_a_dropped_wheel_stops_the_robot_until_it_stands(dropped: protocol.Bumps
     assert rolls(line.robot)
 
 
-def test_safe_mode_is_entered_again_by_release_only() -> None:
-    line = Line()
-    loop = line.control_loop()
+def test_safe_mode_is_entered_again_by_release_only(line: Line, loop: ControlLoop) -> None:
     drive(line, loop, 0.2, 0.1)
     line.robot.touch(protocol.Bumps(0), cliff=True)
     drive(line, loop, 1.0, 0.1)
-    assert loop.active_stop
-    assert loop.active_stop.reason is StopReason.LEFT_SAFE_MODE
+    check_stop(loop, StopReason.LEFT_SAFE_MODE)
     assert line.robot.mode == protocol.Mode.PASSIVE
     loop.release()
     drive(line, loop, 0.2, 0.1)
@@ -119,25 +183,15 @@ def test_safe_mode_is_entered_again_by_release_only() -> None:
     assert rolls(line.robot)
 
 
-def _lost(reply: bytes) -> bytes:
-    return b""
-
-
-def _garbled(reply: bytes) -> bytes:
-    return b"\xff" * 6
-
-
-@pytest.mark.parametrize(("mangle", "halt"), [(_lost, StopReason.SILENT), (_garbled, StopReason.GARBLED)])
-def test_a_lost_link_stops_the_wheels(mangle: Callable[[bytes], bytes], halt: StopReason) -> None:
-    line = Line()
+@pytest.mark.parametrize(("reply", "halt"), [(b"", StopReason.SILENT), (b"\xff" * 6, StopReason.GARBLED)])
+def test_a_lost_link_stops_the_wheels(reply: bytes, halt: StopReason, line: Line) -> None:
     loop = line.control_loop(silence=0.3)
     drive(line, loop, 0.5, 0.1)
-    line.mangle, since = mangle, line.now
+    line.mangle, since = lambda _: reply, line.now
     while rolls(line.robot):
         assert line.now - since <= 0.3 + 0.1 + 2 * PERIOD
         drive(line, loop, PERIOD, 0.1)
-    assert loop.active_stop
-    assert loop.active_stop.reason is halt
+    check_stop(loop, halt)
     line.mangle = lambda reply: reply
     drive(line, loop, 0.5, 0.1)
     assert not rolls(line.robot)  # no automatic restart
@@ -146,14 +200,11 @@ def test_a_lost_link_stops_the_wheels(mangle: Callable[[bytes], bytes], halt: St
     assert rolls(line.robot)
 
 
-def test_an_unplugged_port_is_final() -> None:
-    line = Line()
-    loop = line.control_loop()
+def test_an_unplugged_port_is_final(line: Line, loop: ControlLoop) -> None:
     drive(line, loop, 0.2, 0.1)
     line.gone = True
     drive(line, loop, 0.2, 0.1)
-    assert loop.active_stop
-    assert loop.active_stop.reason is StopReason.UNPLUGGED
+    check_stop(loop, StopReason.UNPLUGGED)
     with pytest.raises(CommandRefused, match="unplugged"):
         loop.release()
 
@@ -196,9 +247,7 @@ garbage = st.none() | added | st.tuples(st.just("cut"), st.binary(max_size=5))
 
 
 @given(st.lists(garbage, min_size=1, max_size=25), st.floats(-0.2, 0.2))
-def test_garbage_costs_only_the_replies_that_it_damages(
-    noise: list[tuple[str, bytes] | None], forward: float
-) -> None:
+def test_garbage_costs_only_the_replies_that_it_damages(noise, forward):
     line = Line()
     loop = line.control_loop(silence=5.0)
     pending = [*noise, *[None] * 3]
@@ -237,9 +286,7 @@ def test_garbage_before_a_reply_costs_nothing(count: int, noise: bytes, forward:
     assert abs(1000 * (loop.take_odometry().dx - line.robot.base.travelled)) < 1 + 1e-6
 
 
-def test_a_command_given_during_a_read_is_checked() -> None:
-    line = Line()
-    loop = line.control_loop()
+def test_a_command_given_during_a_read_is_checked(line: Line, loop: ControlLoop) -> None:
     line.robot.touch(protocol.Bumps.RIGHT)
 
     def mangle(reply: bytes) -> bytes:
@@ -252,9 +299,7 @@ def test_a_command_given_during_a_read_is_checked() -> None:
     assert not rolls(line.robot)
 
 
-def test_commands_from_before_a_stop_are_dropped() -> None:
-    line = Line()
-    loop = line.control_loop()
+def test_commands_from_before_a_stop_are_dropped(line: Line, loop: ControlLoop) -> None:
     drive(line, loop, 0.5, 0.1)
     line.robot.touch(protocol.Bumps.RIGHT)
     loop.poll()
@@ -267,9 +312,7 @@ def test_commands_from_before_a_stop_are_dropped() -> None:
     assert loop.active_stop is None
 
 
-def test_a_reply_followed_by_noise_is_rejected() -> None:
-    line = Line()
-    loop = line.control_loop()
+def test_a_reply_followed_by_noise_is_rejected(line: Line, loop: ControlLoop) -> None:
     drive(line, loop, 0.2, 0.1)
     assert not loop.gap()
     line.arrive(b"\0\0\0")

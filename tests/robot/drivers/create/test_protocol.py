@@ -1,16 +1,19 @@
-"""Bytes of the Open Interface: sent commands, accepted replies."""
+"""Bytes of the Open Interface: sent commands, accepted replies; odometry of whole millimetres, degrees."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
+from robot.drivers.create.driver import CreateOdometry
 from robot.drivers.create.driver_config import CommandRefused, CreateConfig
 from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
+from tactile.base.se2 import compose
 
 SPEED = st.integers(-protocol.TOP_SPEED, protocol.TOP_SPEED)
 
@@ -54,7 +57,6 @@ def test_valid_replies_are_accepted(right: int, left: int, elapsed: float, bumps
     robot.advance(elapsed)
     (reply,) = robot.receive(protocol.QUERY)
     found = protocol.SensorReply.parse(reply, elapsed)
-    assert found is not None
     assert found.bumps == bumps
     assert found.mode == (protocol.Mode.PASSIVE if bumps > 3 else protocol.Mode.SAFE)
     assert abs(found.millimetres - 1000 * robot.base.travelled) < 1
@@ -87,7 +89,7 @@ def test_accepted_replies_are_possible(data: bytes, elapsed: float) -> None:
 @example(0.5, 0.0, 3.875)
 def test_wheel_speeds_are_within_the_limit(cap: float, forward: float, turn: float) -> None:
     config = CreateConfig(speed=cap)
-    apart = turn * config.wheel_base / 2
+    apart = turn * 0.258 / 2
     fits = max(abs(forward + apart), abs(forward - apart)) <= cap  # False for NaN
     try:
         right, left = config.wheel_speeds(forward, turn)
@@ -99,8 +101,62 @@ def test_wheel_speeds_are_within_the_limit(cap: float, forward: float, turn: flo
     assert abs(left - 1000 * (forward - apart)) < 1.001
 
 
-@given(st.floats(-0.1, 0.1), st.floats(-0.7, 0.7))
-def test_wheel_speeds_of_forward_and_turn(forward: float, turn: float) -> None:
-    right, left = CreateConfig().wheel_speeds(forward, turn)
-    assert (right + left) / 2000 == pytest.approx(forward, abs=1e-3)
-    assert (right - left) / 1000 / 0.258 == pytest.approx(turn, abs=4e-3)
+LEG = st.tuples(SPEED, SPEED, st.floats(0.005, 0.5), st.integers(1, 20))  # wheels, s, readings
+LEGS = st.lists(LEG, min_size=1, max_size=12)
+
+
+def readings(legs: list[tuple[int, int, float, int]]) -> tuple[EmulatedCreate, list[tuple[int, int, float]]]:
+    """A robot after some legs, and its readings: mm, degrees, s."""
+    robot, replies = awake(), []
+    for right, left, seconds, count in legs:
+        robot.receive(protocol.drive(right, left))
+        for _ in range(count):
+            robot.advance(seconds)
+            (reply,) = robot.receive(protocol.QUERY)
+            millimetres, degrees, *_ = protocol.REPLY.unpack(reply)
+            replies.append((millimetres, degrees, robot.time))
+    return robot, replies
+
+
+@given(LEGS)
+def test_sums_and_pose_are_accurate_to_the_quantisation(legs: list[tuple[int, int, float, int]]) -> None:
+    robot, replies = readings(legs)
+    assert abs(sum(m for m, _, _ in replies) - 1000 * robot.base.travelled) < 1 + 1e-6
+    assert abs(sum(d for _, d, _ in replies) - math.degrees(robot.base.turned)) < 1 + 1e-6
+    odometer = CreateOdometry(0.0)
+    for reading in replies:
+        odometer.add(*reading)
+    dx, dy, dtheta, dt = odometer.take_odometry()
+    driven = sum(abs(right + left) / 2000 * s * n for right, left, s, n in legs)
+    turned = math.radians(sum(abs(d) for _, d, _ in replies))
+    # Headings err by at most a degree; a millimetre is reported late, in another direction.
+    bound = driven * math.radians(1) + 1e-3 * (1 + turned)
+    assert math.hypot(dx - robot.base.x, dy - robot.base.y) <= bound + 1e-9
+    assert abs(dtheta - robot.base.heading) < math.radians(1) + 1e-9
+    assert dt == pytest.approx(robot.time)
+
+
+@given(LEGS, st.lists(st.booleans(), min_size=240, max_size=240))
+def test_odometry_read_in_parts_is_the_same(legs, taken):
+    _, replies = readings(legs)
+    whole, parts = CreateOdometry(0.0), CreateOdometry(0.0)
+    pose, time = np.zeros(3), 0.0
+    for reading, take in zip(replies, taken, strict=False):
+        whole.add(*reading)
+        parts.add(*reading)
+        if take:
+            *motion, dt = parts.take_odometry()
+            pose, time = compose(pose, np.array(motion)), time + dt
+    *motion, dt = parts.take_odometry()
+    pose, time = compose(pose, np.array(motion)), time + dt
+    total = whole.take_odometry()
+    assert pose[:2] == pytest.approx(total[:2], abs=1e-9)
+    assert math.cos(pose[2] - total.dtheta) == pytest.approx(1)
+    assert time == pytest.approx(total.dt)
+
+
+def test_motion_between_readings_is_an_arc() -> None:
+    odometer = CreateOdometry(0.0)
+    odometer.add(1571, 90, 1.0)  # a quarter of a circle of 1 m
+    assert odometer.take_odometry() == pytest.approx((1.0, 1.0, math.pi / 2, 1.0), abs=2e-4)
+    assert odometer.take_odometry() == (0, 0, 0, 0)

@@ -15,30 +15,26 @@ WHISKERS = 2
 
 
 class MemoryHead:
-    """Attributes:
-    plugged: whether it is connected. stalls: number of the next transfers to refuse. clock: device time, us.
-    commands, requests: received so far. opened, closed: number of connections opened and closed.
+    """A head, and a `robot.drivers.head.device.Bridge` to it.
+
+    Attributes:
+        plugged: whether it is connected. stalls: number of transfers to refuse next. clock: device time, us.
+        commands, requests: received so far. opened, closed: number of connections opened and closed.
     """
 
-    def __init__(self, whiskers: int = WHISKERS, channels: int = CHANNELS) -> None:
-        self.identity = {
-            "name": "memory",
-            "version": "1",
-            "whiskers": whiskers,
-            "channels": channels,
-            "rate": 2000,
-        }
-        self.plugged, self.stalls, self.clock, self.opened = True, 0, 0, 0
+    def __init__(self, whiskers: int = WHISKERS) -> None:
+        self.identity = {"name": "memory", "version": "1", "whiskers": whiskers, "channels": CHANNELS}
+        self.identity["rate"] = 2000
+        self.plugged, self.stalls, self.clock, self.opened, self.closed = True, 0, 0, 0, 0
         self.commands: list[Command] = []
         self.requests: list[Request] = []
-        self.closed = 0
         self._data = bytearray()
         self._there = threading.Condition()
 
-    def connect(self) -> Wire:
-        self.check()
+    def connect(self) -> MemoryHead:
+        self._check()
         self.opened += 1
-        return Wire(self)
+        return self
 
     def put(self, data: bytes) -> None:
         with self._there:
@@ -58,43 +54,33 @@ class MemoryHead:
             self._data.clear()
             self._there.notify_all()
 
-    def check(self) -> None:
+    def read(self, size: int, timeout: float) -> bytes:
+        with self._there:
+            self._there.wait_for(lambda: self._data or not self.plugged, timeout)
+            self._check()
+            data = bytes(self._data[:size])
+            del self._data[:size]
+            return data
+
+    def write(self, data: bytes) -> None:
+        self._check()
+        command = Command.unpack(data)
+        assert command is not None
+        self.commands.append(command)
+
+    def request(self, request: Request) -> bytes:
+        self._check()
+        self.requests.append(request)
+        if request == Request.CLOCK:
+            return self.clock.to_bytes(8, "little")
+        return json.dumps(self.identity).encode() if request == Request.IDENTITY else b""
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def _check(self) -> None:
         if not self.plugged:
             raise Disconnected(errno.ENODEV, "pulled out")
         if self.stalls:
             self.stalls -= 1
             raise Stalled(errno.EPIPE, "refused")
-
-    def take(self, size: int, timeout: float) -> bytes:
-        with self._there:
-            self._there.wait_for(lambda: self._data or not self.plugged, timeout)
-            self.check()
-            data = bytes(self._data[:size])
-            del self._data[:size]
-            return data
-
-
-class Wire:
-    """A `robot.drivers.head.device.Bridge`."""
-
-    def __init__(self, head: MemoryHead) -> None:
-        self.head = head
-
-    def read(self, size: int, timeout: float) -> bytes:
-        return self.head.take(size, timeout)
-
-    def write(self, data: bytes) -> None:
-        self.head.check()
-        command = Command.unpack(data)
-        assert command is not None
-        self.head.commands.append(command)
-
-    def request(self, request: Request) -> bytes:
-        self.head.check()
-        self.head.requests.append(request)
-        if request == Request.CLOCK:
-            return self.head.clock.to_bytes(8, "little")
-        return json.dumps(self.head.identity).encode() if request == Request.IDENTITY else b""
-
-    def close(self) -> None:
-        self.head.closed += 1

@@ -1,10 +1,17 @@
-"""A reference decoder after the definitions of `DecoderCounts`; it works byte by byte."""
+"""A reference decoder after the definitions of `DecoderCounts`, byte by byte, and streams with damage, from
+hypothesis or a seed."""
 
 from __future__ import annotations
 
 import struct
 import zlib
+from random import Random
 from typing import NamedTuple
+
+import numpy as np
+from hypothesis import strategies as st
+
+from robot.drivers.head.usb_protocol import pack_frames
 
 LATE = 4096
 
@@ -95,3 +102,86 @@ def accept_number(number: int, streams: list[Stream]) -> int | None:
             return full
     streams.append(Stream(number + 2**32 * (wraps + 1)))
     return streams[-1].first
+
+
+GARBAGE = (b"", b"\0", b"W", b"WH", b"WHK", b"WHK1", b"WHK1WHK1", b"WHKC", b"1", b"WWHK1", b"\xff" * 9)
+
+
+class Head:
+    """A source of frames with consecutive numbers and times."""
+
+    def __init__(self, whiskers: int, channels: int, sequence: int, time: int, seed: int = 0) -> None:
+        self.shape = whiskers, channels
+        self.sequence, self.time = sequence, time
+        self.sent: list[bytes] = []
+        self.random = np.random.default_rng(seed)
+
+    def frame(self, ahead: int = 1, later: int = 500, flags: int = 0) -> bytes:
+        self.sequence += ahead
+        self.time += later
+        values = self.random.integers(-32768, 32768, (1, *self.shape)).astype(np.int16)
+        self.sent.append(pack_frames([self.sequence], [self.time], [flags], values))
+        return self.sent[-1]
+
+    def foreign(self, field: int, value: int) -> bytes:
+        """A frame of another head with a valid CRC; `field` 0 changes whiskers, 1 channels, 2 version."""
+        body = bytearray(self.frame()[:-4])
+        body[13 + field] = value
+        return bytes(body) + struct.pack("<I", zlib.crc32(body))
+
+    def repeat(self, back: int) -> bytes:
+        return self.sent[-1 - back % len(self.sent)] if self.sent else b""
+
+
+def flip_bits(frame: bytes, place: int, mask: int) -> bytes:
+    data = bytearray(frame)
+    data[place % len(data)] ^= mask
+    return bytes(data)
+
+
+SKIPS = (2, 3, 50, 4095, 4096, 4097, 2**31 - 1, 2**31)
+BACKS = (0, 1, 2, 5, 30, 4094, 4095, 4096, 4097, 2**31)
+TIMES = (-(2**31), -1, 2**31 - 1, 2**31, 2**32 - 1)
+
+
+def frames(head: Head, count: int) -> bytes:
+    return b"".join(head.frame(flags=k & 15) for k in range(count))
+
+
+def event(head: Head, random: Random) -> bytes:
+    """The bytes on the wire of an event."""
+    number = random.randrange(201)
+    events = (
+        lambda: frames(head, 1 + number % 40),
+        lambda: head.frame(ahead=random.choice(SKIPS)),
+        lambda: head.frame(ahead=-random.choice(BACKS)),
+        lambda: head.frame(later=random.choice(TIMES)),
+        lambda: flip_bits(head.frame(), number, random.randrange(1, 256)),
+        lambda: head.frame()[:number],
+        lambda: head.frame()[number:],
+        lambda: head.repeat(number % 31),
+        lambda: head.foreign(number % 3, random.randrange(256)),
+        lambda: b"".join(random.choice(GARBAGE) for _ in range(number % 9)),
+        lambda: bytes(random.randrange(256) for _ in range(number % 61)),
+    )
+    return random.choice(events)()
+
+
+@st.composite
+def streams(draw: st.DrawFn) -> tuple[bytes, list[int], tuple[int, int]]:
+    """Bytes of a stream, cut positions, and shape (whiskers, channels) of its head."""
+    shape = draw(st.sampled_from([(2, 1), (1, 3), (18, 3)]))
+    start = draw(st.sampled_from([0, 1, 4000, 2**31, 2**32 - 60, 2**32 - 1]))
+    head = Head(*shape, start, draw(st.sampled_from([0, 2**32 - 9000])))
+    random, count = draw(st.randoms()), draw(st.integers(0, 14))
+    data = b"".join(event(head, random) for _ in range(count))
+    return data, sorted(draw(st.lists(st.integers(0, len(data)), max_size=12))), shape
+
+
+def damaged_stream(random: Random, size: int) -> bytes:
+    """A long stream with an event after about every sixtieth frame."""
+    head, data = Head(18, 3, 2**32 - 5000, 2**32 - 10**6), bytearray()
+    while len(data) < size:
+        data += frames(head, random.randrange(1, 120)) + event(head, random)
+        del head.sent[:-60]
+    return bytes(data[:size])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
@@ -24,59 +24,39 @@ def settings(host: str, **others: Any) -> ArmConfig:
     return ArmConfig(host=host, **{**patient, **others})
 
 
-class Bench:
-    """Emulators at one address, one at a time."""
-
-    def __init__(self, host: str) -> None:
-        self.host = host
-        self._stack = ExitStack()
-        self._faults: Faults | None = None
-
-    def controller(self) -> Faults:
-        """A running emulator without faults, with its tool at HOME."""
-        if self._faults is None or self._faults.process.poll() is not None:
-            self._stack.close()
-            self._faults = self._stack.enter_context(ur_emulator(self.host, HOME))
-        faults = self._faults
-        faults(do="clear")
-        faults(do="wall")
-        with Dashboard(self.host) as dashboard:
-            dashboard.stop()
-            if faults.state()["mode"] != "RUNNING":
-                dashboard.ask("power on")
-                dashboard.ask("brake release")
-        until(lambda: not faults.state()["moving"])
-        faults(do="place", tcp=HOME.tolist())
-        return faults
-
-    def close(self) -> None:
-        self._stack.close()
-
-
 @pytest.fixture(scope="module")
-def bench(loopback: str) -> Iterator[Bench]:
-    bench = Bench(loopback)
-    yield bench
-    bench.close()
+def bench(loopback: str) -> Iterator[Callable[[], Faults]]:
+    """Gives the running emulator, a new one where the last has ended."""
+    started: list[Faults] = []
+    with ExitStack() as stack:
+
+        def running() -> Faults:
+            if not started or started[-1].process.poll() is not None:
+                stack.close()
+                started.append(stack.enter_context(ur_emulator(loopback, HOME)))
+            return started[-1]
+
+        yield running
 
 
 @pytest.fixture
-def controller(bench: Bench) -> Faults:
-    """The emulated controller."""
-    return bench.controller()
+def controller(bench: Callable[[], Faults]) -> Faults:
+    """The emulated controller, without faults and with its tool at HOME."""
+    faults = bench()
+    faults(do="clear")
+    faults(do="wall")
+    with Dashboard(faults.host) as dashboard:
+        dashboard.stop()
+        if faults.state()["mode"] != "RUNNING":
+            dashboard.ask("power on")
+            dashboard.ask("brake release")
+    until(lambda: not faults.state()["moving"])
+    faults(do="place", tcp=HOME.tolist())
+    return faults
 
 
 @pytest.fixture
 def arm(controller: Faults) -> Iterator[Arm]:
-    """An armed arm."""
     with Arm(settings(controller.host)) as arm:
-        arm.start()
-        yield arm
-
-
-@pytest.fixture
-def alert_arm(controller: Faults) -> Iterator[Arm]:
-    """An armed arm that counts as lost after 1 s without a state."""
-    with Arm(settings(controller.host, stale=1.0)) as arm:
         arm.start()
         yield arm

@@ -1,10 +1,15 @@
-"""The arm by the real library on an emulated controller: moves, and an outcome for each fault."""
+"""The arm by the real library on an emulated controller: moves, an outcome for each fault, and sessions that
+are killed or hang during a motion: the arm stops, and no process or memory remains."""
 
 from __future__ import annotations
 
+import math
 import os
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +18,11 @@ from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.dashboard import Dashboard
 from robot.drivers.ur10.driver_config import BoxConfig
-from robot.drivers.ur10.safety import TargetRefused
-from tests.helpers.live import PATIENCE, Faults, moves, until
+from robot.drivers.ur10.safety import SAFETY_STOPS, TargetRefused
+from tests.helpers.live import PATIENCE, ROOT, Faults, moves, until
 from tests.robot.drivers.ur10.conftest import AWAY, HOME, settings
+
+TARGET = HOME + [0.01, 0.02, 0.0, 0.0, 0.0, 0.0]
 
 
 def start_move(arm: Arm, controller: Faults) -> None:
@@ -43,25 +50,26 @@ def check_stop(arm: Arm, controller: Faults, within: float = PATIENCE) -> Sessio
     return fault.outcome
 
 
-TARGET = HOME + [0.01, 0.02, 0.0, 0.0, 0.0, 0.0]
-
-
 def test_a_move_arrives(arm: Arm, controller: Faults) -> None:
+    """Also one to the present pose."""
     first = len(controller.state()["targets"])
     assert not arm.arrived()
+    arm.move(HOME)
+    until(arm.arrived, "arrival without motion")
     move = arm.move(TARGET)
     assert not arm.arrived()
     began = time.monotonic()
     until(arm.arrived, "arrival")
     assert time.monotonic() - began > 0.5 * move.seconds
     np.testing.assert_allclose(controller.state()["tcp"], TARGET, atol=1e-9)
-    (reached,) = moves(controller, first)
+    *_, reached = moves(controller, first)
     np.testing.assert_array_equal(reached["goal"], TARGET)
-    assert reached["speed"] == arm.config.speed
+    assert (reached["speed"], reached["acceleration"]) == (arm.config.speed, arm.config.acceleration)
+    assert max(math.hypot(*state["speed"][:3]) for state in arm.states()) <= arm.config.speed + 1e-9
     assert arm.fault is None
 
 
-def test_states_are_in_order(arm: Arm, controller: Faults) -> None:
+def test_states_are_in_order(arm: Arm) -> None:
     until(lambda: len(arm.states()) > 100, "states")
     states = arm.states()
     assert (np.diff(states["counter"].astype(int)) == 1).all()
@@ -74,23 +82,12 @@ def test_states_are_in_order(arm: Arm, controller: Faults) -> None:
     assert len(arm.states(after=int(states["counter"][-1]) - 3)) >= 3
 
 
-def test_a_move_to_the_present_pose_arrives(arm: Arm) -> None:
-    arm.move(HOME)
-    until(arm.arrived, "arrival without motion")
-
-
-def test_a_move_after_a_halt(arm: Arm, controller: Faults) -> None:
+def test_moves_after_a_halt_and_instead_of_an_older_move(arm: Arm, controller: Faults) -> None:
     start_move(arm, controller)
     arm.halt()
     until(lambda: not controller.state()["moving"], "a standstill")
     assert controller.state()["tcp"][0] < AWAY[0] - 1e-3
     assert not arm.arrived()
-    arm.move(TARGET)
-    until(arm.arrived, "arrival")
-    assert arm.fault is None
-
-
-def test_a_newer_move_replaces_an_older(arm: Arm, controller: Faults) -> None:
     start_move(arm, controller)
     arm.move(TARGET)
     until(arm.arrived, "arrival")
@@ -99,113 +96,75 @@ def test_a_newer_move_replaces_an_older(arm: Arm, controller: Faults) -> None:
     assert controller.state()["watchdog_stops"] == 0
 
 
-@pytest.mark.parametrize(
-    ("stop", "outcome"),
-    [
-        ("protective", SessionOutcome.PROTECTIVE_STOP),
-        ("safeguard", SessionOutcome.SAFEGUARD_STOP),
-        pytest.param("emergency", SessionOutcome.EMERGENCY_STOP, marks=pytest.mark.soak),
-    ],
-)
-def test_safety_stops(arm: Arm, controller: Faults, stop: str, outcome: SessionOutcome) -> None:
-    start_move(arm, controller)
-    controller(do=stop)
-    assert check_stop(arm, controller) is outcome
-    # States continue, so the pose stays known; after the release of the stop the program does not resume.
-    until(lambda: arm.age() < 0.05, "a fresh state")
-    until(lambda: controller.state()["runtime"] == "STOPPED", "the program is ended")
-    place = controller.state()["tcp"]
-    controller(do="clear")
-    time.sleep(0.15)
-    assert controller.state()["tcp"] == place
-    np.testing.assert_allclose(arm.latest()["tcp"], place, atol=1e-9)
+STALE, MALFORMED, GONE = SessionOutcome.ARM_STALE, SessionOutcome.ARM_MALFORMED, SessionOutcome.ARM_GONE
+FAULTS = {
+    "protective": SessionOutcome.PROTECTIVE_STOP,
+    "safeguard": SessionOutcome.SAFEGUARD_STOP,
+    "stall": STALE,
+    "malformed": MALFORMED,
+    "truncated": MALFORMED,
+    "huge": STALE,
+    "nan": MALFORMED,
+    "freeze": STALE,
+    "the program is ended": GONE,
+    "the process crashes": GONE,
+    "the process hangs": STALE,
+}
 
 
-def test_a_stall(alert_arm: Arm, controller: Faults) -> None:
-    start_move(alert_arm, controller)
-    controller(do="stall", seconds=PATIENCE)
-    assert check_stop(alert_arm, controller) is SessionOutcome.ARM_STALE
-    assert len(alert_arm.history) > 10
+@pytest.mark.parametrize("fault", [*FAULTS, pytest.param("emergency", marks=pytest.mark.soak)])
+def test_a_fault_stops_the_arm(controller: Faults, fault: str) -> None:
+    outcome = FAULTS.get(fault, SessionOutcome.EMERGENCY_STOP)
+    with Arm(settings(controller.host, stale=1.0 if outcome is STALE else 30.0)) as arm:
+        arm.start()
+        start_move(arm, controller)
+        if fault == "the program is ended":
+            with Dashboard(controller.host) as dashboard:
+                dashboard.stop()
+        elif fault.startswith("the process"):
+            os.kill(arm.process.pid, signal.SIGSTOP if "hangs" in fault else signal.SIGSEGV)
+        else:
+            controller(do=fault, **({"seconds": PATIENCE} if fault == "stall" else {}))
+        assert check_stop(arm, controller) is outcome
+        assert len(arm.history) > 10
+        assert fault == "nan" or np.isfinite(arm.history["tcp"]).all()
+        if outcome in SAFETY_STOPS:
+            # States continue, so the pose stays known; once the stop is released the program does not resume.
+            until(lambda: arm.age() < 0.05, "a fresh state")
+            until(lambda: controller.state()["runtime"] == "STOPPED", "the program is ended")
+            place = controller.state()["tcp"]
+            controller(do="clear")
+            time.sleep(0.15)
+            assert controller.state()["tcp"] == place
+            np.testing.assert_allclose(arm.latest()["tcp"], place, atol=1e-9)
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("seconds", [1.0, 3.0])
-def test_a_stall_is_detected_in_time(controller: Faults, seconds: float) -> None:
+def test_a_stall_is_detected_in_time(controller: Faults) -> None:
     with Arm(settings(controller.host, stale=0.5)) as arm:
         arm.start()
         start_move(arm, controller)
-        controller(do="stall", seconds=seconds)
+        controller(do="stall", seconds=3.0)
         began = time.monotonic()
-        assert check_stop(arm, controller, within=0.5) is SessionOutcome.ARM_STALE
-        assert arm.fault is not None
+        assert check_stop(arm, controller, within=0.5) is STALE
         assert arm.fault.time - began < arm.config.stale + 0.3
-
-
-@pytest.mark.parametrize(
-    ("frame", "outcome"),
-    [
-        ("malformed", SessionOutcome.ARM_MALFORMED),
-        ("truncated", SessionOutcome.ARM_MALFORMED),
-        ("huge", SessionOutcome.ARM_STALE),
-    ],
-)
-def test_invalid_frames(alert_arm: Arm, controller: Faults, frame: str, outcome: SessionOutcome) -> None:
-    start_move(alert_arm, controller)
-    controller(do=frame)
-    assert check_stop(alert_arm, controller) is outcome
-    assert np.isfinite(alert_arm.history["tcp"]).all()
-
-
-def test_a_state_that_is_not_finite(arm: Arm, controller: Faults) -> None:
-    start_move(arm, controller)
-    controller(do="nan")
-    assert check_stop(arm, controller) is SessionOutcome.ARM_MALFORMED
-
-
-def test_a_frozen_clock(alert_arm: Arm, controller: Faults) -> None:
-    start_move(alert_arm, controller)
-    controller(do="freeze")
-    assert check_stop(alert_arm, controller) is SessionOutcome.ARM_STALE
 
 
 def test_the_controller_dies(arm: Arm, controller: Faults) -> None:
     start_move(arm, controller)
     controller.die()
-    fault = until(lambda: arm.fault, "a fault")
-    assert fault.outcome is SessionOutcome.ARM_GONE
+    assert until(lambda: arm.fault, "a fault").outcome is GONE
 
 
-def test_the_program_is_ended_on_the_controller(arm: Arm, controller: Faults) -> None:
+def test_a_stop_without_effect_is_repeated_by_the_dashboard(arm: Arm, controller: Faults) -> None:
     start_move(arm, controller)
-    with Dashboard(controller.host) as dashboard:
-        dashboard.stop()
-    assert check_stop(arm, controller) is SessionOutcome.ARM_GONE
-
-
-@pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGKILL])
-def test_the_rtde_process_ends(arm: Arm, controller: Faults, number: int) -> None:
-    start_move(arm, controller)
-    os.kill(arm.process.pid, number)
-    assert check_stop(arm, controller) is SessionOutcome.ARM_GONE
-
-
-def test_the_rtde_process_hangs(alert_arm: Arm, controller: Faults) -> None:
-    start_move(alert_arm, controller)
-    os.kill(alert_arm.process.pid, signal.SIGSTOP)
-    assert check_stop(alert_arm, controller) is SessionOutcome.ARM_STALE
-
-
-def test_a_stop_without_effect_is_repeated_by_the_dashboard(controller: Faults) -> None:
-    with Arm(settings(controller.host)) as arm:
-        arm.start()
-        start_move(arm, controller)
-        ends = controller.state()["program_stops"]
-        os.kill(arm.process.pid, signal.SIGSTOP)
-        arm.halt()
-        until(lambda: not controller.state()["moving"], "a standstill")
-        assert controller.state()["program_stops"] > ends
-        assert controller.state()["tcp"][0] < AWAY[0] - 1e-3
-        os.kill(arm.process.pid, signal.SIGKILL)
+    ends = controller.state()["program_stops"]
+    os.kill(arm.process.pid, signal.SIGSTOP)
+    arm.halt()
+    until(lambda: not controller.state()["moving"], "a standstill")
+    assert controller.state()["program_stops"] > ends
+    assert controller.state()["tcp"][0] < AWAY[0] - 1e-3
+    os.kill(arm.process.pid, signal.SIGKILL)
 
 
 def test_a_target_without_joint_solution(arm: Arm, controller: Faults) -> None:
@@ -225,10 +184,8 @@ def test_a_move_that_does_not_arrive(controller: Faults) -> None:
 
 
 def test_a_state_out_of_the_box(controller: Faults) -> None:
-    config = settings(
-        controller.host, box=BoxConfig(low=tuple(HOME[:3] - 0.2), high=tuple(HOME[:3] + [0.5, 0.2, 0.2]))
-    )
-    with Arm(config) as arm:
+    box = BoxConfig(low=tuple(HOME[:3] - 0.2), high=tuple(HOME[:3] + [0.5, 0.2, 0.2]))
+    with Arm(settings(controller.host, box=box)) as arm:
         arm.start()
         start_move(arm, controller)
         controller(do="place", tcp=(HOME + [0, 0.21, 0, 0, 0, 0]).tolist())
@@ -258,3 +215,67 @@ def test_a_contact_reported_by_the_session(arm: Arm, controller: Faults) -> None
     furthest = until(lambda: arm.still() and controller.state()["tcp"][0], "a standstill")
     until(lambda: controller.state()["tcp"][0] < furthest - 0.009, "the tool backs off")
     assert arm.fault.outcome is SessionOutcome.CONTACT
+
+
+def test_the_rtde_process_checks_every_command(arm: Arm, controller: Faults) -> None:
+    first = len(controller.state()["targets"])
+    here, stops = controller.state()["tcp"], int(arm.shared.control["stops"])
+    for number, target in enumerate(([math.nan] * 6, [9.0, *here[1:]], here[:5], [*here[:3], 0.0, 0.0, 0.0])):
+        arm.process.send(do="move", number=number, target=target, speed=0.01, stops=stops)
+    arm.process.send(do="move", number=9, target=[here[0] + 0.05, *here[1:]], speed=0.3, stops=stops)
+    assert "refused" in until(lambda: arm.fault, "a fault").detail
+    assert moves(controller, first) == []
+    assert controller.state()["tcp"] == here
+    os.kill(arm.process.pid, 0)
+
+
+SESSION = """
+import sys, time
+from robot.drivers.ur10.arm import Arm
+from tests.robot.drivers.ur10.conftest import settings
+arm = Arm(settings(sys.argv[1], heartbeat=1.0, watchdog_hz=2.0))
+arm.start()
+arm.move([float(number) for number in sys.argv[2:]])
+print(arm.process.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def runs(pid: int) -> bool:
+    """Whether a process runs; a zombie does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.parametrize("what", ["killed", "hangs", "killed with the arm's process"])
+def test_the_arm_stops_when_the_session_ends_or_hangs(controller: Faults, what: str) -> None:
+    words = [sys.executable, "-c", SESSION, controller.host, *map(repr, AWAY.tolist())]
+    session = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    try:
+        pid = int(session.stdout.readline())
+        maps = Path(f"/proc/{session.pid}/maps").read_text().splitlines()
+        shared = [line.split(maxsplit=5)[5] for line in maps if "/dev/shm/" in line]
+        until(lambda: controller.state()["speed"][0] > 0.049, "the arm moves")
+        bites = controller.state()["watchdog_stops"]
+        if what == "killed with the arm's process":
+            os.kill(pid, signal.SIGSTOP)  # so that it does not detect the end first
+        session.send_signal(signal.SIGSTOP if what == "hangs" else signal.SIGKILL)
+        if what == "killed with the arm's process":
+            os.kill(pid, signal.SIGKILL)
+        until(lambda: not controller.state()["moving"], "a standstill")
+        place = controller.state()["tcp"]
+        assert place[0] < AWAY[0] - 1e-3, "the arm reached its target"
+        until(lambda: not runs(pid), "the arm's process ends")
+        until(lambda: controller.state()["runtime"] == "STOPPED", "the controller's program ends")
+        assert controller.state()["tcp"] == place
+        if what == "killed with the arm's process":
+            assert controller.state()["watchdog_stops"] == bites + 1
+        if what != "hangs":
+            session.wait(30)
+            assert not [name for name in shared if Path(name).exists()], "shared memory remains"
+    finally:
+        session.kill()
+        session.wait(30)
+        session.stdout.close()

@@ -1,12 +1,13 @@
-"""Reasons not to arm the arm: each is reported with its cure, and the arm does not move."""
+"""Reasons not to arm the arm: each is reported with its cure, and the arm does not move. The stream of poses
+for programs that do not move it."""
 
 from __future__ import annotations
 
-import re
 import socket
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,9 @@ from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.dashboard import PORT, Dashboard, DashboardSilent
 from robot.drivers.ur10.driver_config import ArmConfig, BoxConfig
-from robot.drivers.ur10.safety import StartupRefused, check_controller
+from robot.drivers.ur10.rtde_protocol import PoseListener
+from robot.drivers.ur10.safety import StartupRefused, TargetRefused, check_controller, check_states
+from robot.drivers.ur10.shared_state import ARM_STATE
 from tests.helpers.live import Faults, moves, until
 from tests.robot.drivers.ur10.conftest import HOME, settings
 
@@ -112,21 +115,20 @@ def check_refusal(controller: Faults, **others: Any) -> StartupRefused:
     return refusal.value
 
 
-def test_registers_in_use(controller: Faults) -> None:
+def test_registers_in_use_and_a_tool_outside_the_box(controller: Faults) -> None:
     controller(do="registers")
     assert check_refusal(controller).found == "registers in use"
+    controller(do="clear")
+    box = BoxConfig(low=tuple(HOME[:3] + 0.1), high=tuple(HOME[:3] + 0.2))
+    assert "outside the box" in check_refusal(controller, box=box).found
 
 
-def test_a_slow_stream(controller: Faults) -> None:
-    controller(do="rate", hz=80)
-    found = re.fullmatch(r"stream at (\d+) of 125 Hz", check_refusal(controller, connect=5.0).found)
-    assert found is not None
-    assert int(found[1]) < 112  # 0.9 of the nominal rate; lower still on a busy machine
-
-
-def test_start_outside_the_box(controller: Faults) -> None:
-    refusal = check_refusal(controller, box=BoxConfig(low=tuple(HOME[:3] + 0.1), high=tuple(HOME[:3] + 0.2)))
-    assert "outside the box" in str(refusal)
+@pytest.mark.parametrize(("hz", "refused"), [(125, False), (113, False), (112, True), (0.1, True)])
+def test_a_slow_stream(hz: float, refused: bool) -> None:
+    states = np.zeros(60, ARM_STATE)
+    states["host"], states["tcp"] = np.arange(60) / hz, HOME
+    with pytest.raises(StartupRefused, match=f"stream at {hz:.0f} of 125 Hz") if refused else nullcontext():
+        check_states(ArmConfig(connect=0.01), lambda: states)
 
 
 def test_a_controller_that_does_not_answer_on_its_other_ports(elsewhere: str) -> None:
@@ -135,8 +137,6 @@ def test_a_controller_that_does_not_answer_on_its_other_ports(elsewhere: str) ->
 
 
 def test_an_arm_that_was_not_started_refuses_and_closes(loopback: str) -> None:
-    from robot.drivers.ur10.safety import TargetRefused
-
     with Arm(ArmConfig(host=loopback)) as arm:
         with pytest.raises(TargetRefused, match="not armed"):
             arm.move(HOME)
@@ -154,3 +154,47 @@ def test_a_second_session_is_refused_and_the_first_continues(controller: Faults)
         first.move(HOME + [0.003, 0, 0, 0, 0, 0])
         until(first.arrived, "arrival")
         assert first.fault is None
+
+
+def test_poses_are_streamed_beside_a_program(controller: Faults) -> None:
+    with PoseListener(controller.host) as poses:
+        _, tcp, speed, _ = until(poses.latest)
+        np.testing.assert_allclose(tcp, HOME)
+        assert not speed.any()
+        place = ",".join(map(repr, (HOME + [0, 0.02, 0, 0, 0, 0]).tolist()))
+        with socket.create_connection((controller.host, 30003)) as script:
+            script.sendall(f"movel(p[{place}],a=1,v=0.02)\n".encode())
+            until(lambda: poses.latest().speed[1] == pytest.approx(0.02))
+            first = poses.latest()
+            then = until(lambda: (new := poses.latest()) is not first and new)
+            steps = (then.robot_time - first.robot_time) / 0.008
+            assert steps == pytest.approx(round(steps), abs=1e-6)
+            assert then.tcp[1] - first.tcp[1] == pytest.approx(0.02 * (then.robot_time - first.robot_time))
+            until(lambda: poses.latest().tcp[1] == pytest.approx(HOME[1] + 0.02))
+        assert poses.latest().time <= time.monotonic()
+
+
+@pytest.mark.parametrize("fault", ["close", "malformed"])
+def test_a_lost_stream_of_poses_is_restored(controller: Faults, fault: str) -> None:
+    with PoseListener(controller.host, patience=0.3) as poses:
+        before = until(poses.latest)
+        controller(do=fault)
+        until(lambda: poses.latest().robot_time > before.robot_time + 0.1)
+
+
+def test_poses_stop_during_a_stall_and_resume(controller: Faults) -> None:
+    with PoseListener(controller.host, patience=30.0) as poses:
+        until(poses.latest)
+        controller(do="stall", seconds=600)
+        time.sleep(0.3)  # states sent before the stall
+        stood = poses.latest()
+        time.sleep(0.2)
+        assert poses.latest() is stood
+        controller(do="clear")
+        until(lambda: poses.latest() is not stood)
+
+
+def test_without_a_controller_there_is_no_pose() -> None:
+    with PoseListener("127.0.0.1", port=1, patience=0.2) as poses:
+        time.sleep(0.1)
+        assert poses.latest() is None

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -30,27 +31,28 @@ def write(shared: SharedState, count: int) -> None:
         shared.publish(state)
 
 
-def test_states_come_in_order_and_once() -> None:
+@pytest.fixture
+def shared() -> Iterator[SharedState]:
     shared = SharedState()
-    try:
-        assert shared.latest() is None
-        assert len(shared.since(0)) == 0
-        write(shared, 10)
-        assert shared.since(0)["counter"].tolist() == list(range(1, 11))
-        assert shared.since(7)["counter"].tolist() == [8, 9, 10]
-        assert len(shared.since(10)) == 0
-        assert len(shared.since(99)) == 0
-        write(shared, SLOTS)
-        states = shared.since(3)
-        assert states["counter"][-1] == SLOTS + 10
-        assert np.diff(states["counter"]).tolist() == [1] * (SLOTS - 2)
-        np.testing.assert_array_equal(states["counter"], states["robot"])
-    finally:
-        shared.close()
+    yield shared
+    shared.close()
 
 
-def test_a_reader_beside_a_writer_sees_whole_states_only() -> None:
-    shared, count = SharedState(), 60_000
+def test_states_come_in_order_and_once(shared: SharedState) -> None:
+    assert shared.latest() is None
+    assert len(shared.since(0)) == 0
+    write(shared, 10)
+    assert shared.since(0)["counter"].tolist() == list(range(1, 11))
+    assert shared.since(7)["counter"].tolist() == [8, 9, 10]
+    assert len(shared.since(10)) == len(shared.since(99)) == 0
+    write(shared, SLOTS)
+    states = shared.since(3)
+    assert states["counter"].tolist() == list(range(12, SLOTS + 11))
+    np.testing.assert_array_equal(states["counter"], states["robot"])
+
+
+def test_a_reader_beside_a_writer_sees_whole_states_only(shared: SharedState) -> None:
+    count = 20_000
     writer = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(shared.fd), str(count)],
         cwd=Path(__file__).parents[4],
@@ -77,7 +79,6 @@ def test_a_reader_beside_a_writer_sees_whole_states_only() -> None:
     finally:
         writer.kill()
         writer.wait()
-        shared.close()
 
 
 def test_the_memory_has_no_name_and_is_released_on_close() -> None:

@@ -14,6 +14,7 @@ from tactile.base.errors import InputError
 from tests.helpers.ros_bags import ROS2, built, scan
 
 AHEAD = Mount(np.eye(3), np.zeros(3))
+LIFT = np.array([0.0, 0.0, 0.3])
 ROLLED = Mount(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # upside down
 Refused = Callable[..., InputError]
 
@@ -35,17 +36,18 @@ def sectors(content: Any, pixels: int, mount: Mount = AHEAD, max_range: float = 
 def test_a_fan_keeps_groups_of_consecutive_beams() -> None:
     assert sectors(message([1, 3, 2, 2, 8, 0], -0.5, 0.2), 3) == [0.5, 0.5, 0.5]
     assert sectors(message([1, 1, 1, 2, 2], -0.5, 0.2), 2) == [0.25, 0.5]  # 3 and 2 beams
-
-
-def test_a_fan_keeps_the_order_of_its_beams() -> None:
     for first, step, mount in ((-0.2, 0.2, AHEAD), (0.2, -0.2, AHEAD), (-0.2, 0.2, ROLLED)):
         assert sectors(message([1, 2, 3], first, step), 3, mount) == [0.25, 0.5, 0.75]
 
 
 def test_a_ring_runs_counter_clockwise() -> None:
-    """Also of a scan that runs clockwise."""
+    """Also of a scan that runs clockwise, and of a sensor upside down."""
     step = 2 * np.pi / 8
     assert sectors(message([1, 2, 2, 3, 3, 4, 4, 1], step / 2, -step), 4) == [0.75, 0.5, 0.25, 1.0]
+    ranges = np.full(360, 4.0)
+    ranges[1:90] = 1.0  # to the left of its axis, hence to the right of the robot
+    found = sectors(message(ranges, 0.0, np.pi / 180), 4, ROLLED)
+    assert found == pytest.approx([1, 0.25, 1, 1], abs=0.02)
 
 
 @pytest.mark.parametrize("first", [0.0, -np.pi])
@@ -59,13 +61,6 @@ def test_a_ring_begins_behind_the_robot(first: float, yaw: float) -> None:
     ranges[(direction > np.deg2rad(181)) & (direction < np.deg2rad(224))] = 2.0
     found = sectors(message(ranges, first, step), 8, turned(yaw))
     assert found == pytest.approx([0.25, 1, 1, 1, 0.5, 1, 1, 1], abs=0.05)
-
-
-def test_a_ring_of_a_sensor_upside_down_is_turned_over() -> None:
-    step = 2 * np.pi / 360
-    ranges = np.full(360, 4.0)
-    ranges[1:90] = 1.0  # to the left of its axis, hence to the right of the robot
-    assert sectors(message(ranges, 0.0, step), 4, ROLLED) == pytest.approx([1, 0.25, 1, 1], abs=0.02)
 
 
 SHARED = Extent(0.0, 1.8, 0.1)  # 18 beams over 1.8 rad: six sectors of three
@@ -86,11 +81,9 @@ VARIED: dict[str, tuple[list[int], float, float, list[float]]] = {
 def test_beams_go_to_sectors_by_direction(case: str) -> None:
     ranges, first, step, expected = VARIED[case]
     view = scan_view(message(ranges, first, step), AHEAD, 6, 4.0, "here", SHARED)
-    assert view is not None
     assert view.pixels == pytest.approx(np.array(expected) / 4, abs=0.01)
-    assert view.covered == pytest.approx(
-        {"without its ends": 4 / 6, "shifted": 5 / 6, "too narrow": 1 / 6}.get(case, 1)
-    )
+    covered = {"without its ends": 4 / 6, "shifted": 5 / 6, "too narrow": 1 / 6}.get(case, 1)
+    assert view.covered == pytest.approx(covered)
 
 
 def test_a_part_of_a_ring_has_the_sectors_of_the_ring() -> None:
@@ -100,10 +93,8 @@ def test_a_part_of_a_ring_has_the_sectors_of_the_ring() -> None:
     shared = Extent(0.0, 2 * np.pi, step)
     part = message(whole[9:], -np.pi / 2 + step / 2, step)
     view = scan_view(part, AHEAD, 4, 4.0, "here", shared)
-    assert view is not None
     assert (view.pixels.tolist(), view.covered) == ([0.5, 0.5, 0.75, 0.5], 0.75)
     rear = scan_view(part, turned(np.pi), 4, 4.0, "here", shared)
-    assert rear is not None
     assert rear.pixels.tolist() == [0.75, 0.5, 0.5, 0.5]
 
 
@@ -111,10 +102,8 @@ def test_the_span_of_scans_is_what_they_cover_together() -> None:
     first = Extent(0.0, -1.0, 0.01)
     assert wider_extent([first, Extent(2 * np.pi + 0.001, 1.0, 0.01)]) is None
     wider = wider_extent([first, Extent(0.2, 1.0, 0.01), Extent(-0.1, 0.2, 0.01)])
-    assert wider is not None
     assert wider.span == pytest.approx((0.7, -0.5))
     ring = wider_extent([Extent(0.0, 4.0, 0.01), Extent(np.pi, 4.0, 0.01)])
-    assert ring is not None
     assert ring.span == (-np.pi, np.pi)
     assert wider_extent([first, first, Extent(3.0, 1.0, 0.01)]) is None  # most cover a part of it
 
@@ -127,13 +116,10 @@ def test_beams_without_a_measurement_do_not_count() -> None:
     assert sectors(message([0, 0, 1, 3], -0.5, 0.1, range_min=0.1), 2) == [1.0, 0.5]  # a sector without any
     assert sectors(message([0, 0, np.nan, 0], -0.5, 0.1, range_min=0.1), 2) is None
     assert sectors(message([np.inf] * 4, -0.5, 0.1), 2) == [1.0, 1.0]
+    assert sectors(message([1, 3], -0.5, 0.1, range_max=0.0), 2) == [0.25, 0.75]  # no limit can be meant
     step = 2 * np.pi / 8
     ring = message([np.nan, 1, 0.05, 2, np.inf, 4, 90, 4], -np.pi + step / 2, step, range_min=0.1)
     assert sectors(ring, 4) == pytest.approx([0.25, 0.5, 1.0, 1.0])
-
-
-def test_limits_that_cannot_be_meant_are_ignored() -> None:
-    assert sectors(message([1, 3], -0.5, 0.1, range_max=0.0), 2) == [0.25, 0.75]
 
 
 def test_angles_that_are_no_numbers_are_refused(refused: Refused) -> None:
@@ -142,27 +128,19 @@ def test_angles_that_are_no_numbers_are_refused(refused: Refused) -> None:
     refused(lambda: sectors(message([1, 3], 0.0, 0.1), 3), "2 beams", "each of 3 sectors")
 
 
+FIELDS = [{"name": name, "offset": 4 * k, "datatype": 7, "count": 1} for k, name in enumerate("xyz")]
+
+
 def cloud(points: np.ndarray, order: str = "<", **fields: Any) -> Any:
     """A cloud of float32 x, y, z with a gap of four bytes, as lidar drivers write it."""
-    kind = np.dtype(
-        {"names": ["x", "y", "z"], "formats": [f"{order}f4"] * 3, "offsets": [0, 4, 8], "itemsize": 16}
-    )
-    rows = np.zeros(len(points), kind)
-    for axis, column in zip("xyz", points.T, strict=True):
-        rows[axis] = column
-    named = [
-        {"name": axis, "offset": 4 * index, "datatype": 7, "count": 1} for index, axis in enumerate("xyz")
-    ]
-    given = {
-        "height": 1,
-        "width": len(points),
-        "fields": named,
+    rows = np.pad(points, ((0, 0), (0, 1))).astype(f"{order}f4")
+    size = {"height": 1, "width": len(points), "point_step": 16, "row_step": 16 * len(points)}
+    data = {
+        "fields": FIELDS,
         "is_bigendian": int(order == ">"),
-        "point_step": 16,
-        "row_step": 16 * len(points),
         "data": np.frombuffer(rows.tobytes(), np.uint8),
     }
-    return built(ROS2, "sensor_msgs/msg/PointCloud2", given | fields)
+    return built(ROS2, "sensor_msgs/msg/PointCloud2", size | data | fields)
 
 
 POINTS = np.array([[-1, -0.01, 0.5], [-3, -0.02, 0.5], [2, 0.5, 0.5], [0.1, 0.1, -0.2], [np.nan, 0, 0.5]])
@@ -171,18 +149,11 @@ POINTS = np.array([[-1, -0.01, 0.5], [-3, -0.02, 0.5], [2, 0.5, 0.5], [0.1, 0.1,
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_a_cloud_is_the_nearest_point_of_each_degree(order: str) -> None:
     view = cloud_view(cloud(POINTS, order), AHEAD, (0.1, 1.0), 360, 4.0, "here")
-    assert view is not None
     near = {0: 1.0 / 4, 180 + int(np.rad2deg(np.arctan2(0.5, 2))): np.hypot(2, 0.5) / 4}
     assert {int(i): view.pixels[i] for i in np.flatnonzero(view.pixels < 1)} == pytest.approx(near, rel=1e-4)
-
-
-def test_a_cloud_is_seen_from_the_robot() -> None:
-    """Mounted 0.3 m high, to the left: its x axis is the robot's y axis."""
-    mount = Mount(turned(np.pi / 2).rotation, np.array([0.0, 0.0, 0.3]))
-    view = cloud_view(
-        cloud(np.array([[1.0, 0.0, 0.0], [2.0, 0.0, -0.25]])), mount, (0.1, 1.0), 4, 4.0, "here"
-    )
-    assert view is not None
+    # Mounted 0.3 m high, to the left: its x axis is the robot's y axis.
+    mount, points = turned(np.pi / 2)._replace(position=LIFT), np.array([[1.0, 0.0, 0.0], [2.0, 0.0, -0.25]])
+    view = cloud_view(cloud(points, order), mount, (0.1, 1.0), 4, 4.0, "here")
     assert np.flatnonzero(view.pixels < 1).tolist() == [3]
     assert view.lowest == pytest.approx(1.0)
 
@@ -193,8 +164,6 @@ def test_a_damaged_cloud_is_refused(refused: Refused) -> None:
 
     refused(lambda: read(cloud(POINTS, fields=[])), "here", "a cloud of no fields", "fields x, y and z")
     refused(lambda: read(cloud(POINTS, width=50)), "1 x 50 points", "data that fit")
-    odd = [
-        {"name": axis, "offset": 4 * index, "datatype": 99, "count": 1} for index, axis in enumerate("xyz")
-    ]
+    odd = [field | {"datatype": 99} for field in FIELDS]
     refused(lambda: read(cloud(POINTS, fields=odd)), "data that fit")
     assert read(cloud(np.full((3, 3), np.nan))) is None

@@ -1,4 +1,4 @@
-"""Lateness of a loop, priorities of processes, and which findings name this machine."""
+"""Lateness of a loop, priorities of processes, which findings name this machine, and what is imported."""
 
 from __future__ import annotations
 
@@ -50,34 +50,42 @@ def test_the_largest_delay_of_the_last_second_counts() -> None:
     assert meter.turn(12.0) == pytest.approx(1.78)
 
 
-@pytest.mark.parametrize(("late", "named"), [(0.04, False), (0.06, True)])
+@pytest.mark.parametrize(("late", "named"), [(0.049, False), (0.05, True)])
 def test_states_that_are_missing_because_this_machine_is_late(late: float, named: bool) -> None:
     finding = stale_finding(0.11, late, 0.1)
     assert finding.outcome is (SessionOutcome.HOST_LATE if named else SessionOutcome.ARM_STALE)
-    assert finding.detail.endswith("no new state for 0.110 s")
-    assert ("this machine was 0.060 s late" in finding.detail) == named
+    assert ("this machine was 0.050 s late" in finding.detail) == named
 
 
 @pytest.mark.parametrize(
-    ("config", "unreset", "late", "outcome"),
+    ("config", "unreset", "late", "machine"),
     [
-        (REAL, 0.05, 0.09, SessionOutcome.ARM_GONE),  # reset in time: something else ended the script
-        (REAL, 0.13, 0.01, SessionOutcome.ARM_GONE),  # the controller or the network is slow
-        (REAL, 0.13, 0.06, SessionOutcome.HOST_LATE),
-        (ArmConfig(), 0.13, 0.01, SessionOutcome.HOST_LATE),  # the emulator is slow, on this machine
-        (ArmConfig(), 0.05, 0.01, SessionOutcome.ARM_GONE),
+        (REAL, 0.099, 0.09, None),  # reset in time: something else ended the script
+        (REAL, 0.13, 0.049, None),  # the controller or the network is slow
+        (REAL, 0.13, 0.05, 0.05),
+        (ArmConfig(), 0.13, 0.01, 0.03),  # the emulator is slow, on this machine
+        (ArmConfig(), 0.05, 0.01, None),
     ],
 )
-def test_a_control_script_that_ended(
-    config: ArmConfig, unreset: float, late: float, outcome: SessionOutcome
-) -> None:
+def test_a_control_script_that_ended(config, unreset, late, machine):
     finding = ended_script_finding(config, unreset, late)
-    assert finding.outcome is outcome
+    assert finding.outcome is (SessionOutcome.HOST_LATE if machine else SessionOutcome.ARM_GONE)
     assert ("was not reset for 0.130 s" in finding.detail) == (unreset > 0.1)
-    assert ("this machine was" in finding.detail) == (outcome is SessionOutcome.HOST_LATE)
+    assert ("this machine was" in finding.detail) == bool(machine)
+    assert not machine or f"was {machine:.3f} s late" in finding.detail
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no scheduling policies")
 def test_control_before_mapping_before_drawing() -> None:
     """Whatever this system allows."""
     subprocess.run([sys.executable, "-c", PRIORITIES], check=True, timeout=60)
+
+
+def test_importing_drivers_and_readers_imports_no_library_of_a_device_or_format() -> None:
+    code = """
+import sys
+import robot.drivers.create.driver, robot.drivers.head.whisk_control, robot.recordings.formats
+heavy = {"usb", "libusb_package", "serial", "mcap", "zstandard", "scipy", "jax", "ratslam", "robot.emulators"}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
