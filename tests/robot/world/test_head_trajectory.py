@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from robot.world.maze import CELL_SIDE, cell_centre, circuit_route, random_loop
@@ -16,72 +16,55 @@ SEEDS = st.integers(0, 1000)
 STEADY = JitterConfig(position=0, yaw_deg=0, speed=0)
 
 
+def route(seed: int, word: str = "CA") -> list[tuple[int, int]]:
+    return circuit_route(random_loop(5, 4, 12, stream(seed, "maze.loop")), word)
+
+
 def path_of(seed: int, word: str = "CA", **changes: object) -> HeadPath:
-    way = circuit_route(random_loop(7, 5, 20, stream(seed, "maze.loop")), word)
-    return plan_path(MotionConfig(**changes), way, stream(seed, "motion"))
+    return plan_path(MotionConfig(**changes), route(seed, word), stream(seed, "motion"))
 
 
 @given(SEEDS)
 def test_without_jitter_the_path_joins_cell_centres_and_faces_ahead(seed: int) -> None:
     path = path_of(seed, jitter=STEADY)
-    way = circuit_route(random_loop(7, 5, 20, stream(seed, "maze.loop")), "CA")
     passed = path.pose[np.concatenate([[True], np.abs(np.diff(path.pose[:, :2], axis=0)).sum(axis=1) > 1e-9])]
-    assert np.allclose(passed[:, :2], [cell_centre(cell) for cell in way], atol=1e-12)
+    assert np.allclose(passed[:, :2], [cell_centre(cell) for cell in route(seed)], atol=1e-12)
     step, took = np.diff(path.pose, axis=0), np.diff(path.time)
     driven = np.hypot(step[:, 0], step[:, 1])
     straight = driven > 1e-9
     assert np.allclose(driven[straight] / took[straight], 0.03)
     assert np.allclose(step[straight, 2], 0)
-    assert np.allclose(
-        wrap(np.arctan2(step[straight, 1], step[straight, 0]) - path.pose[1:][straight, 2]), 0, atol=1e-9
-    )
+    course = np.arctan2(step[straight, 1], step[straight, 0])
+    assert np.allclose(wrap(course - path.pose[1:][straight, 2]), 0, atol=1e-9)
     assert np.allclose(np.abs(step[~straight, 2]) / took[~straight], 0.4)
     assert (np.abs(step[:, 2]) <= np.pi + 1e-12).all()
-    assert np.isclose(path.duration, 40 * CELL_SIDE / 0.03 + np.abs(step[:, 2]).sum() / 0.4)
+    assert np.isclose(path.duration, 24 * CELL_SIDE / 0.03 + np.abs(step[:, 2]).sum() / 0.4)
 
 
 @given(SEEDS)
 def test_backwards_faces_against_the_direction_of_travel(seed: int) -> None:
-    """The headings are those of the opposite direction of travel."""
-    way = circuit_route(random_loop(7, 5, 20, stream(seed, "maze.loop")), "A")
-    there = plan_path(MotionConfig(jitter=STEADY), way, stream(seed, "motion"))
-    back = plan_path(MotionConfig(jitter=STEADY, backwards=True), way[::-1], stream(seed, "motion"))
+    there = plan_path(MotionConfig(jitter=STEADY), route(seed, "A"), stream(seed, "motion"))
+    turned = MotionConfig(jitter=STEADY, backwards=True)
+    back = plan_path(turned, route(seed, "A")[::-1], stream(seed, "motion"))
     assert np.isclose(there.duration, back.duration)
     time = np.linspace(0, there.duration, 200)
     one, other = poses_at(there, time), poses_at(back, there.duration - time)
     assert np.allclose(one[:, :2], other[:, :2], atol=1e-9)
     assert np.allclose(wrap(one[:, 2] - other[:, 2]), 0, atol=1e-9)
+    assert (poses_at(there, np.array([-5.0, 1e9])) == there.pose[[0, -1]]).all()
 
 
-def test_visits_vary_by_the_configured_jitter() -> None:
-    jitter = JitterConfig(position=0.005, yaw_deg=3.0, speed=0.1)
-    path = path_of(0, "A" * 60, jitter=jitter)
-    steady = path_of(0, "A" * 60, jitter=STEADY)
-    off = path.pose - steady.pose
-    assert off[:, :2].std() == pytest.approx(0.005, rel=0.1)
-    assert np.degrees(off[:, 2]).std() == pytest.approx(3.0, rel=0.1)
-    took = np.diff(path.time) / np.diff(steady.time)
-    turns = np.hypot(*np.diff(steady.pose[:, :2], axis=0).T) < 1e-9
-    assert np.allclose(took[turns], 1)
-    assert (1 / took[~turns]).std() == pytest.approx(0.1, rel=0.1)
-
-
-@given(SEEDS, st.integers(0, 1000))
-def test_a_path_depends_on_its_seed_only(seed: int, other: int) -> None:
-    one, again = path_of(seed), path_of(seed)
-    assert (one.pose == again.pose).all()
-    if other != seed:
-        assert path_of(other).pose.shape != one.pose.shape or (path_of(other).pose != one.pose).any()
-
-
-def test_time_increases_and_poses_are_clamped_to_the_ends() -> None:
-    path = path_of(3)
+def test_the_path_of_a_seed_stays_the_same_with_the_configured_jitter() -> None:
+    path = path_of(3, jitter=JitterConfig(position=0.005, yaw_deg=3.0, speed=0.1))
     assert (np.diff(path.time) > 0).all()
-    assert (poses_at(path, np.array([-5.0, 1e9])) == path.pose[[0, -1]]).all()
+    np.testing.assert_allclose(path.time[[1, 2, -1]], [6.165587, 10.092578, 191.124197], atol=1e-6)
+    np.testing.assert_allclose(path.pose[0], [0.634887, 0.088557, 1.548726], atol=1e-6)
+    np.testing.assert_allclose(path.pose[-1], [0.630716, 0.094068, 4.738440], atol=1e-6)
 
 
 @settings(max_examples=40)
 @given(SEEDS, st.lists(st.floats(0.05, 0.7), min_size=1, max_size=4), st.floats(1.0, 30.0))
+@example(0, [0.95], 45.0)
 def test_a_kidnap_continues_at_the_later_pose(seed: int, shares: list[float], ahead: float) -> None:
     path = path_of(seed)
     when = [share * path.duration for share in shares]
@@ -95,12 +78,5 @@ def test_a_kidnap_continues_at_the_later_pose(seed: int, shares: list[float], ah
     assert there.duration == pytest.approx(min(ended, path.duration - ahead * count))
     time = np.linspace(0, there.duration, 300)
     skipped = ahead * (time[:, None] > jumps).sum(axis=1)
-    away = np.abs(time[:, None] - jumps).min(axis=1) > 1e-6
+    away = np.abs(time[:, None] - jumps).min(axis=1, initial=np.inf) > 1e-6
     assert np.allclose(poses_at(there, time)[away], poses_at(path, time + skipped)[away], atol=1e-9)
-
-
-def test_a_kidnap_beyond_the_end_ends_the_path() -> None:
-    path = path_of(0)
-    there, jumps = add_kidnaps(path, [path.duration - 10.0], 45.0)
-    assert there.duration == pytest.approx(path.duration - 10.0)
-    assert len(jumps) == 0

@@ -1,8 +1,9 @@
-"""Mazes: random loops, walls as boxes, and the file format."""
+"""Mazes: random loops, walls as boxes, the file format, and routes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import networkx
@@ -11,51 +12,56 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.world.maze import (
-    CELL_SIDE,
-    WALL_HEIGHT,
-    WALL_THICKNESS,
-    Maze,
-    cell_centre,
-    change_walls,
-    closed_maze,
-    describe_box,
-    maze_text,
-    random_loop,
-    random_maze,
-    read_maze,
-    tree_maze,
-    wall_boxes,
-)
+from robot.world import maze as mazes
+from robot.world.maze import CELL_SIDE, Cell, Maze, circuit_route, closed_maze, random_loop, read_maze
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
 SEEDS = st.integers(0, 10**6)
+SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
+DRAWN = """o---o---o---o---o
+|   |           |
+o   o   o   o   o
+|   |   |       |
+o---o   o   o   o
+|               |
+o---o---o---o---o
+"""
+TREE = """o---o---o---o---o
+|   |           |
+o   o   o---o   o
+|           |   |
+o---o---o---o   o
+|               |
+o---o---o---o---o
+"""
 
 
-def maze_of(seed: int, columns: int = 7, rows: int = 5, length: int = 20, share: float = 0.6) -> Maze:
-    loop = random_loop(columns, rows, length, stream(seed, "maze.loop"))
-    return random_maze(columns, rows, loop, share, stream(seed, "maze.walls"))
+def world(seed: int, share: float = 0.6, size: tuple[int, int] = (4, 3), length: int = 8):
+    loop = random_loop(*size, length, stream(seed, "maze.loop"))
+    return mazes.random_maze(*size, loop, share, stream(seed, "maze.walls")), loop
 
 
-@given(SEEDS, st.sampled_from([(7, 5, 20), (5, 5, 20), (12, 8, 20), (12, 8, 40), (2, 2, 4), (3, 2, 6)]))
+def boxes_of(maze: Maze, seed: int = 0, *heights: tuple[float, ...]) -> mazes.Walls:
+    return mazes.wall_boxes(maze, stream(seed, "maze.heights"), *heights)
+
+
+@given(SEEDS, st.sampled_from([(7, 5, 20), (5, 5, 20), (12, 8, 40), (2, 2, 4), (3, 2, 6)]))
 def test_a_loop_is_closed_simple_and_anticlockwise(seed: int, size: tuple[int, int, int]) -> None:
-    columns, rows, length = size
-    loop = random_loop(columns, rows, length, stream(seed, "maze.loop"))
+    loop = random_loop(*size, stream(seed, "maze.loop"))
     cells = np.array(loop)
-    assert len(set(loop)) == len(loop) == length
-    assert (cells >= 0).all()
-    assert (cells < [columns, rows]).all()
-    steps = np.roll(cells, -1, axis=0) - cells
-    assert (np.abs(steps).sum(axis=1) == 1).all()
+    assert len(set(loop)) == len(loop) == size[2]
+    assert ((cells >= 0) & (cells < size[:2])).all()
+    assert (np.abs(np.roll(cells, -1, axis=0) - cells).sum(axis=1) == 1).all()
     x, y = cells.T
     assert np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0
-    assert loop == random_loop(columns, rows, length, stream(seed, "maze.loop"))
+    assert mazes.make_anticlockwise(loop) == loop
+    assert mazes.make_anticlockwise([loop[0], *loop[:0:-1]]) == loop
 
 
 @given(SEEDS, st.integers(1, 9), st.integers(1, 9))
 def test_one_way_joins_each_two_cells_of_a_tree(seed: int, columns: int, rows: int) -> None:
-    maze = tree_maze(columns, rows, np.random.default_rng(seed))
+    maze = mazes.tree_maze(columns, rows, np.random.default_rng(seed))
     cells = [(column, row) for column in range(columns) for row in range(rows)]
     graph = networkx.Graph()
     graph.add_nodes_from(cells)
@@ -65,155 +71,118 @@ def test_one_way_joins_each_two_cells_of_a_tree(seed: int, columns: int, rows: i
     assert maze.along[:, [0, -1]].all()
 
 
-def test_mazes_of_different_seeds_differ() -> None:
-    loops = {tuple(random_loop(7, 5, 20, stream(seed, "maze.loop"))) for seed in range(20)}
-    assert len(loops) >= 18
+def test_a_seed_gives_the_same_maze_and_route_for_ever() -> None:
+    maze, loop = world(3)
+    assert loop == [(3, 2), (2, 2), (1, 2), (1, 1), (1, 0), (2, 0), (2, 1), (3, 1)]
+    assert mazes.maze_text(maze) == DRAWN
+    tree = mazes.tree_maze(4, 3, stream(3, "x"))
+    assert mazes.maze_text(tree) == TREE
+    way = mazes.exploration_route(tree, (0, 0), 12, stream(0, "path"))
+    assert way == [
+        *[(x, 0) for x in range(4)],
+        (3, 1),
+        (3, 2),
+        (2, 2),
+        (1, 2),
+        (1, 1),
+        (0, 1),
+        (0, 2),
+        (0, 1),
+    ]
+    within = mazes.exploration_route(maze, loop[2], 200, stream(1, "path"), loop[2:])
+    assert set(within) == set(loop[2:])
+    mazes.check_route(maze, within)
+    winding = [(0, 0), (0, 1), (1, 1), (2, 1), (3, 1), (3, 0), (2, 0), (1, 0)]
+    assert mazes.winding_loop(4, 2, stream(3, "loop")) == winding
 
 
-@pytest.mark.parametrize(
-    ("columns", "rows", "length"), [(7, 5, 21), (7, 5, 2), (3, 3, 10), (7, 5, 36), (5, 1, 4)]
-)
-def test_an_impossible_loop_length_is_refused(
-    columns: int, rows: int, length: int, refused: Callable[..., InputError]
-) -> None:
-    refused(
-        lambda: random_loop(columns, rows, length, stream(0, "x")), "simulation.maze.loop", f"{length} cells"
-    )
+@pytest.mark.parametrize("size", [(7, 5, 21), (7, 5, 2), (3, 3, 10), (7, 5, 36), (5, 1, 4)])
+def test_an_impossible_loop_length_is_refused(size: tuple[int, int, int], refused: Callable) -> None:
+    refused(lambda: random_loop(*size, stream(0, "x")), "simulation.maze.loop", f"{size[2]} cells")
 
 
 @given(SEEDS)
 def test_the_loop_is_open_and_the_outer_wall_closed(seed: int) -> None:
-    loop = random_loop(7, 5, 20, stream(seed, "maze.loop"))
-    maze = random_maze(7, 5, loop, 1.0, stream(seed, "maze.walls"))
+    maze, loop = world(seed, share=1.0)
     assert maze.across[[0, -1]].all()
     assert maze.along[:, [0, -1]].all()
     for k, cell in enumerate(loop):
-        assert set(maze.neighbours(cell)) == {loop[k - 1], loop[(k + 1) % 20]}
-    assert (~maze.across).sum() + (~maze.along).sum() == 20
-    bare = random_maze(7, 5, loop, 0.0, stream(seed, "maze.walls"))
-    assert bare.across.sum() + bare.along.sum() == 2 * 7 + 2 * 5
-
-
-def test_the_share_of_walls_is_configurable() -> None:
-    mazes = [maze_of(seed, share=0.6) for seed in range(60)]
-    inner = np.concatenate([maze.across[1:-1].ravel() for maze in mazes])
-    # About 10 of the 20 openings of a loop are in the 28 `across` walls.
-    assert abs(inner.mean() - 0.6 * (1 - 10 / 28)) < 0.04
+        assert set(maze.neighbours(cell)) == {loop[k - 1], loop[(k + 1) % 8]}
+    assert (~maze.across).sum() + (~maze.along).sum() == 8
+    bare, _ = world(seed, share=0.0)
+    assert bare.across.sum() + bare.along.sum() == 2 * 4 + 2 * 3
 
 
 @given(SEEDS, st.floats(0, 1), st.sampled_from([(7, 5), (12, 8), (2, 2)]))
 def test_a_maze_file_is_read_back_equal(
     tmp_path_factory: pytest.TempPathFactory, seed: int, share: float, size: tuple[int, int]
 ) -> None:
-    maze = maze_of(seed, *size, length=4, share=share)
-    path = tmp_path_factory.getbasetemp() / "maze.txt"
-    for written in (
-        maze_text(maze),
-        maze_text(maze).replace("o", "+"),
-        "\n\n" + maze_text(maze) + "\n",
-        maze_text(maze).rstrip(),
-    ):
+    maze, _ = world(seed, share, size, 4)
+    path, text = tmp_path_factory.getbasetemp() / "maze.txt", mazes.maze_text(maze)
+    for written in (text, text.replace("o", "+"), "\n\n" + text + "\n", text.rstrip()):
         path.write_text(written)
-        read = read_maze(path)
-        assert (read.across == maze.across).all()
-        assert (read.along == maze.along).all()
-
-
-def test_the_first_line_of_a_maze_file_is_the_north_wall(tmp_path: Path) -> None:
-    (tmp_path / "maze.txt").write_text("o---o---o\n|     S |\no   o---o\n|   | G |\no---o---o\n")
-    maze = read_maze(tmp_path / "maze.txt")
-    assert maze.is_open((0, 1), (1, 1))
-    assert maze.is_open((0, 0), (0, 1))
-    assert not maze.is_open((1, 0), (1, 1))
-    assert not maze.is_open((0, 0), (1, 0))
+        assert all(np.array_equal(a, b) for a, b in zip(read_maze(path), maze, strict=True))
 
 
 @pytest.mark.parametrize(
     ("change", "where", "found"),
     [
-        (("|   |   |\no", "|   |    \no"), "maze.txt:4:9", "gap in the east wall"),
-        (("|   |   |\no", "    |   |\no"), "maze.txt:4:1", "gap in the west wall"),
-        (("|\no---o---o", "|\no---o   o"), "maze.txt:7:6", "gap in the south wall"),
-        (("\n\no---o", "\n\no   o"), "maze.txt:3:2", "gap in the north wall"),
-        (("o   o", "o-- o"), "maze.txt:5:2", "'-- '"),
-        (("o   o", "x   o"), "maze.txt:5:1", "'x'"),
-        (("|   |   |\no", "|   #   |\no"), "maze.txt:4:5", "'#'"),
-        (("\no   o", ""), "maze.txt", "4 columns + 1"),
+        (("|   |   |\no", "|   |    \no"), ":4:9", "gap in the east wall"),
+        (("|   |   |\no", "    |   |\no"), ":4:1", "gap in the west wall"),
+        (("|\no---o---o", "|\no---o   o"), ":7:6", "gap in the south wall"),
+        (("\n\no---o", "\n\no   o"), ":3:2", "gap in the north wall"),
+        (("o   o", "o-- o"), ":5:2", "'-- '"),
+        (("o   o", "x   o"), ":5:1", "'x'"),
+        (("|   |   |\no", "|   #   |\no"), ":4:5", "'#'"),
+        (("\no   o", ""), "", "4 columns + 1"),
+        (("|   |   |\n", ""), "", "4 lines of up to 9"),
     ],
 )
 def test_a_faulty_maze_file_is_refused(
-    tmp_path: Path, change: tuple[str, str], where: str, found: str, refused: Callable[..., InputError]
+    tmp_path: Path, change: tuple[str, str], where: str, found: str, refused: Callable
 ) -> None:
     good = "\n\no---o---o\n|   |   |\no   o---o\n|   |   |\no---o---o\n"
     path = tmp_path / "maze.txt"
     path.write_text(good)
     read_maze(path)
     path.write_text(good.replace(*change, 1))
-    refused(lambda: read_maze(path), where, found)
+    refused(lambda: read_maze(path), f"maze.txt{where}: ", found)
 
 
-def test_a_binary_file_is_refused(tmp_path: Path, refused: Callable[..., InputError]) -> None:
-    refused(lambda: read_maze(tmp_path / "none.txt"), "none.txt", "no such file")
-    (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe\x00")
-    refused(lambda: read_maze(tmp_path / "bytes.txt"), "bytes.txt", "malformed")
+def test_an_empty_maze_file_is_refused(tmp_path: Path, refused: Callable) -> None:
     (tmp_path / "empty.txt").write_text("\n\n")
     refused(lambda: read_maze(tmp_path / "empty.txt"), "empty.txt", "0 lines")
 
 
-@given(SEEDS)
-def test_boxes_are_at_the_walls_of_the_maze(seed: int) -> None:
-    maze = maze_of(seed)
-    boxes = wall_boxes(maze, stream(seed, "maze.heights"))
-    posts = 8 * 6
-    assert len(boxes.box) == maze.across.sum() + maze.along.sum() + posts
-    assert (boxes.height == WALL_HEIGHT).all()
-    size = boxes.box[:, 2:] - boxes.box[:, :2]
-    assert np.allclose(size.min(axis=1), WALL_THICKNESS)
-    assert np.allclose(size[:-posts].max(axis=1), CELL_SIDE - WALL_THICKNESS)
-    # Between two cells there is a box exactly where there is a wall.
-    inside = boxes.box[:-posts]
-    for a, b in (((2, 2), (3, 2)), ((2, 2), (2, 3)), ((0, 0), (1, 0)), ((6, 3), (6, 4))):
-        x, y = (cell_centre(a) + cell_centre(b)) / 2
-        hit = (inside[:, 0] < x) & (x < inside[:, 2]) & (inside[:, 1] < y) & (y < inside[:, 3])
-        assert hit.any() != maze.is_open(a, b)
-    # No two boxes overlap.
-    west, south, east, north = (boxes.box + [1e-9, 1e-9, -1e-9, -1e-9]).T
-    over = (
-        (west[:, None] < east) & (west < east[:, None]) & (south[:, None] < north) & (south < north[:, None])
-    )
-    assert over.sum() == len(boxes.box)
-
-
-def test_walls_have_the_given_heights_and_posts_the_largest() -> None:
-    boxes = wall_boxes(maze_of(0), stream(0, "maze.heights"), (0.03, 0.05, 0.04))
-    assert set(boxes.height[:-48]) == {0.03, 0.04, 0.05}
-    assert set(boxes.height[-48:]) == {0.05}
-
-
-def test_boxes_have_names() -> None:
-    maze = maze_of(0, share=1.0)
-    boxes = wall_boxes(maze, stream(0, "maze.heights"))
-    names = [describe_box(boxes, k) for k in range(len(boxes.box))]
-    assert len(set(names)) == len(names)
-    assert names[0] == "the wall south of cell (0, 0)"
-    assert names[-1] == "the post at corner (7, 5)"
-    assert names[int(maze.across.sum())] == "the wall west of cell (0, 0)"
-
-
-def test_cells_that_are_not_neighbours_are_a_programming_error() -> None:
-    with pytest.raises(ValueError, match="not neighbours"):
-        maze_of(0).is_open((0, 0), (1, 1))
+def test_boxes_are_at_the_walls_of_the_maze() -> None:
+    """Two cells with a wall between: across, along, posts; west, south, east, north."""
+    boxes, post, long = boxes_of(closed_maze(2, 1)), 0.006, CELL_SIDE - 0.006
+    flat = [[x + post, y - post, x + long, y + post] for y in (0, CELL_SIDE) for x in (0, CELL_SIDE)]
+    upright = [[x - post, post, x + post, long] for x in (0, CELL_SIDE, 2 * CELL_SIDE)]
+    posts = [[x - post, y - post, x + post, y + post] for y in (0, 0.18) for x in (0, 0.18, 0.36)]
+    np.testing.assert_allclose(boxes.box, [*flat, *upright, *posts], atol=1e-12)
+    assert (boxes.height == 0.05).all()
+    mixed = boxes_of(world(0)[0], 0, (0.03, 0.05, 0.04))
+    assert set(mixed.height[:-20]) == {0.03, 0.04, 0.05}
+    assert set(mixed.height[-20:]) == {0.05}
+    names = [mazes.describe_box(boxes, k) for k in (0, 3, 4, 6, 7, 12)]
+    assert names == [
+        *("the wall south of cell (0, 0)", "the wall south of cell (1, 1)"),
+        *("the wall west of cell (0, 0)", "the wall west of cell (2, 0)"),
+        *("the post at corner (0, 0)", "the post at corner (2, 1)"),
+    ]
+    assert mazes.cell_centre((2, 0)).tolist() == pytest.approx([0.45, 0.09])
 
 
 def test_changed_walls_are_those_named() -> None:
-    before = maze_of(3)
-    gap = next((c, r) for r in range(5) for c in range(6) if not before.along[r, c + 1])
-    wall = next((c, r) for r in range(5) for c in range(6) if before.along[r, c + 1])
+    before, _ = world(3)
+    gap = next((c, r) for r in range(3) for c in range(3) if not before.along[r, c + 1])
+    wall = next((c, r) for r in range(3) for c in range(3) if before.along[r, c + 1])
     added, removed = (gap, (gap[0] + 1, gap[1])), (wall, (wall[0] + 1, wall[1]))
-    after = change_walls(before, [added], [removed[::-1]])
+    after = mazes.change_walls(before, [added], [removed[::-1]])
     assert np.argwhere(after.along != before.along).tolist() == sorted([[r, c + 1] for c, r in (gap, wall)])
     assert (after.across == before.across).all()
-    assert change_walls(after, [removed], [added]).along.tolist() == before.along.tolist()
+    assert mazes.change_walls(after, [removed], [added]).along.tolist() == before.along.tolist()
 
 
 @pytest.mark.parametrize(
@@ -224,12 +193,64 @@ def test_changed_walls_are_those_named() -> None:
         (((0, 0), (1, 0)), "added", "a wall between"),
     ],
 )
-def test_a_change_that_is_none_is_refused(
-    pair: tuple[tuple[int, int], tuple[int, int]], key: str, found: str, refused: Callable[..., InputError]
-) -> None:
-    changes: dict[str, list[tuple[tuple[int, int], tuple[int, int]]]] = {
-        "added": [],
-        "removed": [],
-        key: [pair],
-    }
-    refused(lambda: change_walls(closed_maze(2, 2), **changes), f"simulation.maze.{key}[0]: {found}")
+def test_a_change_that_is_none_is_refused(pair: tuple[Cell, Cell], key: str, found: str, refused) -> None:
+    changes: dict[str, list[tuple[Cell, Cell]]] = {"added": [], "removed": []}
+    changes[key].append(pair)
+    refused(lambda: mazes.change_walls(closed_maze(2, 2), **changes), f"simulation.maze.{key}[0]: {found}")
+    with pytest.raises(ValueError, match="not neighbours"):
+        closed_maze(2, 2).is_open((0, 0), (1, 1))
+
+
+@given(st.text("CAca", min_size=1, max_size=12), st.integers(0, 1000))
+def test_each_letter_is_one_circuit(word: str, seed: int) -> None:
+    maze, loop = world(seed)
+    way = circuit_route(loop, word)
+    mazes.check_route(maze, way)
+    assert len(way) == len(word) * len(loop) + 1
+    for k, letter in enumerate(word.upper()):
+        lap = way[k * len(loop) : (k + 1) * len(loop) + 1]
+        assert lap[0] == lap[-1] == loop[0]
+        assert lap[:-1] == (loop if letter == "A" else [loop[0], *loop[:0:-1]])
+
+
+@given(st.integers(0, 1000))
+def test_an_exploration_passes_no_wall_and_turns_back_only_in_dead_ends(seed: int) -> None:
+    maze, loop = world(seed)
+    way = mazes.exploration_route(maze, loop[0], 200, stream(seed, "path"))
+    assert len(way) == 200
+    mazes.check_route(maze, way)
+    for before, here, after in zip(way, way[1:], way[2:], strict=False):
+        assert after != before or maze.neighbours(here) == [before]
+
+
+@given(st.integers(1, 8), st.integers(1, 8), st.integers(0, 1000))
+def test_a_winding_loop_visits_every_cell_once(columns: int, rows: int, seed: int) -> None:
+    columns, rows = 2 * columns, 2 * rows
+    loop = mazes.winding_loop(columns, rows, stream(seed, "loop"))
+    assert sorted(loop) == [(x, y) for x in range(columns) for y in range(rows)]
+    for (x, y), (next_x, next_y) in pairwise([*loop, loop[0]]):
+        assert abs(next_x - x) + abs(next_y - y) == 1
+
+
+@pytest.mark.parametrize("word", ["", "CAB", "C A"])
+def test_invalid_words_are_refused(word: str, refused: Callable[..., InputError]) -> None:
+    refused(lambda: circuit_route(SQUARE, word), "simulation.path.circuits", repr(word))
+
+
+def test_impossible_routes_are_refused_with_their_step(refused: Callable[..., InputError]) -> None:
+    maze, loop = world(0)
+    rows = [[(x, y) for x in range(4)] for y in range(3)]
+    blocked = next([a, b] for row in rows for a, b in pairwise(row) if not maze.is_open(a, b))
+    wall = f"the wall between cells {blocked[0]} and {blocked[1]}"
+    for way, *pieces in (
+        (blocked, "simulation.path.cells[0] to [1]", wall),
+        ([(0, 0), (4, 0)], "cells[1]", "cell (4, 0)", "columns 0 to 3"),
+        ([(0, -1), (0, 0)], "cells[0]", "cell (0, -1)", "rows 0 to 2"),
+        ([(0, 0), (0, 0)], "cells[0] to [1]", "neighbouring"),
+        ([*loop[:2], loop[5]], "cells[1] to [2]", "neighbouring"),
+    ):
+        refused(lambda way=way: mazes.check_route(maze, way), *pieces)
+    alone = closed_maze(3, 3)
+    refused(lambda: mazes.exploration_route(alone, (1, 1), 5, stream(0, "path")), "(1, 1) is walled in")
+    refused(lambda: mazes.make_anticlockwise([*SQUARE, *SQUARE]), "simulation.path.loop", "(0, 0) twice")
+    refused(lambda: mazes.make_anticlockwise(SQUARE[:3]), "3 cells")

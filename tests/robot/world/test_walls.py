@@ -17,22 +17,19 @@ STEP = 1 / 600
 SHARES = np.arange(1, 161) / 160
 """Checked points of the shaft, as fractions of its length."""
 WIDE = (RingConfig(length=0.05, radius=0.09, height=0.09), RingConfig(length=0.16, radius=0.12, height=0.17))
+FIVE = (RingConfig(length=0.16, radius=0.05, height=0.16),)
 HEADS = {
     "ur10": (HeadConfig(), 65.0),
     "steep": (HeadConfig(rest_deg=60.0, first_deg=17.0), 70.0),
     "past the vertical": (HeadConfig(rest_deg=45.0, limit_deg=100.0, rings=WIDE), 95.0),
-    "one ring of five": (
-        HeadConfig(rings=(RingConfig(length=0.16, radius=0.05, height=0.16),), whiskers=5),
-        70.0,
-    ),
+    "one ring of five": (HeadConfig(rings=FIVE, whiskers=5), 70.0),
 }
 
 
 def maze_of(seed: int, heights: tuple[float, ...] = (0.05,)) -> Walls:
     loop = random_loop(3, 3, 8, stream(seed, "maze.loop"))
-    return wall_boxes(
-        random_maze(3, 3, loop, 0.6, stream(seed, "maze.walls")), stream(seed, "heights"), heights
-    )
+    maze = random_maze(3, 3, loop, 0.6, stream(seed, "maze.walls"))
+    return wall_boxes(maze, stream(seed, "heights"), heights)
 
 
 def search_contact(head: Head, boxes: Walls, pose: np.ndarray, sweep: float) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +58,7 @@ def test_contact_agrees_with_the_search(name: str) -> None:
     head, sweep = ur10_head(config), np.radians(degrees)
     random = np.random.default_rng(0)
     late, beside, missed = [], [], []
-    for seed in range(5):
+    for seed in range(3):
         boxes = maze_of(seed, (0.05, 0.03))
         poses = np.column_stack([random.uniform(0, 0.54, (2, 2)), random.uniform(-9, 9, 2)])
         contact = Surroundings(boxes, head).contact(poses)
@@ -73,7 +70,7 @@ def test_contact_agrees_with_the_search(name: str) -> None:
             missed += (there & ~met)[there].tolist()
             nearest = np.where(inside, np.abs(SHARES[:, None] - reach), 1.0).min(axis=0)
             beside += nearest[met & (angle > 0)].tolist()
-    assert len(late) > 10
+    assert len(late) > 4
     # The search may miss a corner touched for less than a step.
     assert min(late) > -1e-9
     assert np.quantile(late, 0.95) < 0.006
@@ -99,34 +96,17 @@ def test_the_tip_touches_the_top_of_a_wall_and_the_shaft_its_far_edge() -> None:
     assert first_contact(-0.2, -0.1, 0.04)[0] == NO_CONTACT  # behind
 
 
-@settings(max_examples=30)
-@given(st.integers(0, 50), st.floats(0, 0.54), st.floats(0, 0.54), st.floats(-4, 4))
-def test_a_turn_by_one_column_shifts_contacts_by_one_column(
-    seed: int, x: float, y: float, heading: float
-) -> None:
-    around = Surroundings(maze_of(seed), ur10_head(HeadConfig()))
-    one, turned = around.contact(np.array([[x, y, heading], [x, y, heading + np.pi / 3]])).angle.reshape(
-        2, 3, 6
-    )
-    assert np.allclose(np.roll(one, -1, axis=1), turned, atol=1e-6, equal_nan=True)
-
-
-@settings(max_examples=30)
-@given(st.integers(0, 50), st.integers(1, 40))
+@settings(max_examples=15)
+@given(st.integers(0, 50), st.integers(1, 12))
 def test_a_query_of_many_poses_equals_queries_of_each(seed: int, count: int) -> None:
-    random = np.random.default_rng(seed)
+    random, walls, head = np.random.default_rng(seed), maze_of(seed), ur10_head(HeadConfig())
     pose = np.column_stack([random.uniform(-0.1, 0.64, (count, 2)), random.uniform(-9, 9, count)])
-    around = Surroundings(maze_of(seed), ur10_head(HeadConfig()))
-    whole = around.contact(pose)
+    pose[0] = 30.0, -20.0, 1.0  # far from walls
+    whole = Surroundings(walls, head).contact(pose)
     for row in range(count):
-        alone = Surroundings(maze_of(seed), ur10_head(HeadConfig())).contact(pose[row : row + 1])
+        alone = Surroundings(walls, head).contact(pose[row : row + 1])
         for column, other in zip(whole, alone, strict=True):
             assert (column[row] == other[0]).all()
+    assert (whole.angle[0] == NO_CONTACT).all()
     assert ((whole.wall >= 0) == np.isfinite(whole.angle)).all()
     assert (whole.reach[~np.isfinite(whole.angle)] == 0).all()
-
-
-def test_no_contact_far_from_walls() -> None:
-    contact = Surroundings(maze_of(0), ur10_head(HeadConfig())).contact(np.array([[30.0, -20.0, 1.0]]))
-    assert (contact.angle == NO_CONTACT).all()
-    assert (contact.wall == -1).all()

@@ -84,40 +84,32 @@ def test_drift_is_followed_where_the_fixed_rule_crosses(seed: int, rate: float) 
 
 
 @settings(max_examples=12)
-@given(SEEDS, st.floats(10, 300))
-def test_a_vibration_is_no_contact(seed: int, sds: float) -> None:
-    samples = noise(seed, 600)
-    row = np.arange(400)
-    ringing = sds * np.exp(-row / 100) * np.sin(2 * np.pi * row / 4 + 0.3)
-    samples[200:, 0] += FREE.noise[0] * ringing[:, None]
-    assert (run(samples) == Touch.FREE).all()
-    assert sds < 30 or find_fixed_contacts(noise(1, 200), samples).any()
+@given(SEEDS, st.floats(10, 300), st.floats(100, 2000))
+def test_vibration_and_creep_after_a_contact_are_no_contact(seed: int, sds: float, pressed: float) -> None:
+    shaken, crept, row = noise(seed, 600), noise(seed, 1200), np.arange(800)
+    ringing = sds * np.exp(-row[:400] / 100) * np.sin(2 * np.pi * row[:400] / 4 + 0.3)
+    shaken[200:, 0] += FREE.noise[0] * ringing[:, None]
+    assert (run(shaken) == Touch.FREE).all()
+    assert sds < 30 or find_fixed_contacts(noise(1, 200), shaken).any()
+    press(crept, 200, 400, pressed)
+    crept[400:, 0, 1] += 0.012 * pressed * FREE.noise[0, 1] * np.exp(-row / 100)
+    assert (run(crept)[405:] == Touch.FREE).all()
 
 
-@settings(max_examples=12)
-@given(SEEDS, st.floats(100, 2000))
-def test_creep_after_a_contact_is_no_contact(seed: int, sds: float) -> None:
-    samples = noise(seed, 1200)
-    press(samples, 200, 400, sds)
-    samples[400:, 0, 1] += 0.012 * sds * FREE.noise[0, 1] * np.exp(-np.arange(800) / 100)
-    assert (run(samples)[405:] == Touch.FREE).all()
-
-
-def test_a_bent_whisker_is_named_and_still_feels() -> None:
-    samples = noise(0, 1600)
+def test_a_bent_whisker_is_named_still_feels_and_is_free_when_it_returns() -> None:
+    samples, returned = noise(0, 1600), noise(0, 2000)
     press(samples, 200, 10_000, 80)
     press(samples, 1000, 1100, 60)
     touch = run(samples, bent_time=2.0)[:, 0]
-    assert (touch[215:590] == Touch.CONTACT).all()
-    assert (touch[630:990] == Touch.BENT).all()
-    assert (touch[1015:1090] == Touch.CONTACT).all()
-    assert (touch[1110:] == Touch.BENT).all()
-
-
-def test_a_bent_whisker_that_returns_is_free() -> None:
-    samples = noise(0, 2000)
-    press(samples, 200, 1200, 80)
-    touch = run(samples, bent_time=2.0)[:, 0]
+    for rows, kind in (
+        (slice(215, 590), Touch.CONTACT),
+        (slice(630, 990), Touch.BENT),
+        (slice(1015, 1090), Touch.CONTACT),
+        (slice(1110, None), Touch.BENT),
+    ):
+        assert (touch[rows] == kind).all()
+    press(returned, 200, 1200, 80)
+    touch = run(returned, bent_time=2.0)[:, 0]
     assert (touch[630:1180] == Touch.BENT).all()
     assert (touch[1240:] == Touch.FREE).all()
 

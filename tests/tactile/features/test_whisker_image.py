@@ -9,17 +9,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from tactile.base.errors import InputError
-from tactile.base.types import Cycle, Odometry, Whisk, observation
+from tactile.base.types import Cycle, Odometry, Whisk
 from tactile.calibration import Calibration
 from tactile.frontend import Frontend, TouchConfig
 from tactile.whisker_geometry import HeadConfig, shaft_points, tip_height, ur10_head
-from tactile.whisker_image import (
-    MIN_BRIGHTNESS,
-    ImageConfig,
-    view_shape,
-    whisk_observation,
-    whisker_image,
-)
+from tactile.whisker_image import MIN_BRIGHTNESS, ImageConfig, view_shape, whisk_observation, whisker_image
 
 HEAD = ur10_head(HeadConfig())
 ODOMETRY = Odometry(0.03, 0.001, 0.02, 1.0)
@@ -31,16 +25,8 @@ CONFIGS = st.builds(
 
 def _whisks() -> st.SearchStrategy[Whisk]:
     truths, angles = arrays(bool, 18), arrays(float, 18, elements=st.floats(0, float(SWEEP)))
-    drawn = st.builds(
-        Whisk,
-        odometry=st.just(ODOMETRY),
-        alive=truths,
-        contact=truths,
-        touched=angles,
-        held=truths,
-        highest=angles,
-        reach=arrays(float, 18, elements=st.floats(0, 1)),
-    )
+    reach = arrays(float, 18, elements=st.floats(0, 1))
+    drawn = st.builds(Whisk, st.just(ODOMETRY), truths, truths, angles, truths, angles, reach)
     return drawn.map(lambda whisk: whisk._replace(held=whisk.held & whisk.contact))
 
 
@@ -88,9 +74,6 @@ def test_a_dead_whisker_has_no_effect(config: ImageConfig, whisk: Whisk, number:
 @given(_whisks())
 def test_the_observation_has_view_contacts_and_points(whisk: Whisk) -> None:
     seen = whisk_observation(ImageConfig(), HEAD, whisk)
-    plain = observation(ODOMETRY, np.zeros((3, 6, 1)), whiskers=18)
-    for one, other in zip(seen[1:], plain[1:], strict=True):
-        assert (np.shape(one), np.asarray(one).dtype) == (np.shape(other), np.asarray(other).dtype)
     assert seen.odometry == ODOMETRY
     assert (seen.contact == whisk.contact & whisk.alive).all()
     along = np.where(whisk.reach > 0, whisk.reach, 1.0) * HEAD.length
@@ -102,23 +85,37 @@ def test_the_observation_has_view_contacts_and_points(whisk: Whisk) -> None:
 @given(CONFIGS, _whisks())
 def test_the_front_end_observes_the_image_of_a_whisk(config: ImageConfig, whisk: Whisk) -> None:
     frontend = Frontend(TouchConfig(image=config))
-    assert frontend.view_shape == view_shape(config, HEAD)
-    assert frontend.whiskers == 18
+    assert (frontend.view_shape, frontend.whiskers) == (view_shape(config, HEAD), 18)
     one, other = frontend.observe(whisk), whisk_observation(config, HEAD, whisk)
-    for field, same in zip(one[1:], other[1:], strict=True):
-        assert (np.asarray(field) == np.asarray(same)).all()
+    assert all(np.array_equal(field, same) for field, same in zip(one[1:], other[1:], strict=True))
     assert frontend.observe(other) is other
+    dead = Frontend(TouchConfig(image=config, head=HeadConfig(dead=(3, 11)))).observe(whisk)
+    lost = np.isin(np.arange(18), [3, 11])
+    assert not (dead.alive | dead.contact)[lost].any()
+    shape = (18, -1)
+    assert np.array_equal(dead.view.reshape(shape), one.view.reshape(shape) * ~lost[:, None])
+    assert bool(one.view_seen) == whisk.alive.any()
 
 
-@given(_whisks())
-def test_whiskers_configured_as_dead_are_not_alive(whisk: Whisk) -> None:
-    there, dead = Frontend(TouchConfig()), Frontend(TouchConfig(head=HeadConfig(dead=(3, 11))))
-    one, other = there.observe(whisk), dead.observe(whisk)
-    assert not other.alive[[3, 11]].any()
-    assert not other.contact[[3, 11]].any()
-    assert (other.view.reshape(18)[[3, 11]] == 0).all()
-    rest = np.delete(np.arange(18), [3, 11])
-    assert (one.view.reshape(18)[rest] == other.view.reshape(18)[rest]).all()
+STILL = np.full((18, 2), 2e-3)
+CALIBRATION = Calibration(0 * STILL, STILL, 20 * STILL, np.full(18, SWEEP), np.ones(18, bool), 2000.0)
+
+
+@pytest.mark.parametrize("given", [{}, {"image": {"radial": True, "transform": "max_angle"}}])
+def test_a_dropped_whisk_has_motion_but_no_view(given: dict[str, object]) -> None:
+    frontend = Frontend(TouchConfig.model_validate(given), CALIBRATION)
+    seen = frontend.observe(Cycle(np.zeros(0), np.zeros((0, 18)), np.zeros((0, 18, 2)), ODOMETRY))
+    assert tuple(seen.odometry) == tuple(ODOMETRY)
+    for part in (seen.view_seen, seen.view, seen.contact, seen.point, seen.wall):
+        assert not np.any(part)
+    assert not seen.alive.any()  # unread whiskers must not count as free
+    touched = np.linspace(0.1, 0.9, 18)
+    full = frontend.observe(
+        Whisk(ODOMETRY, touched > 0, touched > 0.5, touched, touched > 0.7, touched, touched)
+    )
+    # One chunk can hold both.
+    for one, other in zip([*seen.odometry, *seen[1:]], [*full.odometry, *full[1:]], strict=True):
+        assert (np.shape(one), np.asarray(one).dtype) == (np.shape(other), np.asarray(other).dtype)
 
 
 def test_raw_samples_need_a_calibration() -> None:
@@ -126,8 +123,6 @@ def test_raw_samples_need_a_calibration() -> None:
     cycle = Cycle(np.arange(count) / 2000, np.zeros((count, 18)), np.zeros((count, 18, 2)), ODOMETRY)
     with pytest.raises(InputError, match="calibration: raw whisker samples without a calibration"):
         Frontend(TouchConfig()).observe(cycle)
-    still = np.full((18, 2), 2e-3)
-    known = Calibration(0 * still, still, 20 * still, np.full(18, SWEEP), np.ones(18, bool), 2000.0)
-    seen = Frontend(TouchConfig(), known).observe(cycle)
+    seen = Frontend(TouchConfig(), CALIBRATION).observe(cycle)
     assert seen.view_seen
     assert (seen.view == 0).all()

@@ -34,8 +34,8 @@ def fitted(signal: np.ndarray, free: int = 4000, contact: np.ndarray | None = No
     return fit_signals(SignalRecord(signal[:free], signal, BLOCK, BLOCK / RATE, contact, names, "counts"))
 
 
-def test_noise_colour_and_drift_are_found() -> None:
-    found = fitted(record())
+def test_noise_colour_and_drift_are_found_in_any_unit() -> None:
+    found, other = fitted(record()), fitted(record(scale=1e-3))
     np.testing.assert_allclose(found.noise, NOISE, rtol=0.1)
     np.testing.assert_allclose(found.white, NOISE * np.sqrt(1 - COLOUR), rtol=0.1)
     np.testing.assert_allclose(found.correlation, COLOUR, atol=0.1)
@@ -43,39 +43,21 @@ def test_noise_colour_and_drift_are_found() -> None:
     np.testing.assert_allclose(found.baseline, np.broadcast_to(BASE, (WHISKERS, 3)), atol=6)
     assert not found.dead.any()
     assert found.dirty == {}
+    for a, b in zip(found[:3], other[:3], strict=True):
+        np.testing.assert_allclose(1e-3 * a, b, rtol=1e-9)
+    np.testing.assert_allclose(found.correlation, other.correlation, rtol=1e-9)
 
 
-def test_white_noise_without_drift_has_neither() -> None:
-    random = np.random.default_rng(1)
-    found = fitted(BASE + NOISE * random.standard_normal((ROWS, WHISKERS, 3)))
-    assert abs(np.median(found.correlation)) < 0.05
-    assert np.median(found.drift) < 0.2 * DRIFT
-
-
-def test_dead_and_dirty_whiskers_are_named() -> None:
+def test_dead_and_dirty_whiskers_are_named_and_the_drift_of_one_in_contact_is_unknown() -> None:
     signal = record(2)
     signal[:, 1] = 12.5  # a broken wire
     signal[1000:1800, 3, 0] += 400  # a contact in the free record
-    found = fitted(signal)
+    found = fitted(signal, contact=np.array([0, 0.05, 0.3, 0, 0]))
+    assert np.isnan(found.drift).any(axis=1).tolist() == [False, False, True, False, False]
     assert np.flatnonzero(found.dead).tolist() == [1]
     assert [*found.dirty] == [3]
     assert "standard deviation" in found.dirty[3]
     np.testing.assert_allclose(found.noise[3], NOISE, rtol=0.3)
     assert (found.noise[1] == 0).all()
-
-
-def test_the_drift_of_a_whisker_in_contact_is_unknown() -> None:
-    found = fitted(record(3), contact=np.array([0, 0.05, 0.3, 0, 0]))
-    assert np.isnan(found.drift).any(axis=1).tolist() == [False, False, True, False, False]
-
-
-def test_results_scale_with_the_unit() -> None:
-    one, other = fitted(record(4)), fitted(record(4, scale=1e-3))
-    for a, b in zip(one[:3], other[:3], strict=True):
-        np.testing.assert_allclose(1e-3 * a, b, rtol=1e-9)
-    np.testing.assert_allclose(one.correlation, other.correlation, rtol=1e-9)
-
-
-def test_a_short_record_is_refused() -> None:
     with pytest.raises(InputError, match="samples"):
         fitted(record()[:30])

@@ -24,16 +24,16 @@ from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, wrap
 from tactile.base.types import MotionKind, Report, StepEnd
 
-SHORT = {"reports": 150}
+FWD1, FWD2, TURN = CreateState.FWD1, CreateState.FWD2, CreateState.TURN
 
 
 def simulate(**changes: Any) -> CreateSimulation:
-    return CreateSimulation(CreateSimulationConfig.model_validate(SHORT | changes))
+    return CreateSimulation(CreateSimulationConfig.model_validate({"reports": 60} | changes))
 
 
 @cache
-def session(seed: int, side: float = 1.25) -> CreateSimulation:
-    return CreateSimulation(CreateSimulationConfig.model_validate({"seed": seed, "arena": {"side": side}}))
+def session(seed: int, side: float = 1.25, reports: int | None = None) -> CreateSimulation:
+    return simulate(seed=seed, arena={"side": side}, reports=reports)
 
 
 def column(simulation: CreateSimulation, name: str) -> np.ndarray:
@@ -51,49 +51,57 @@ def bits(source: Source) -> list[list[bytes]]:
     return [list(leaves(sample)) for sample in source]
 
 
-def test_a_session_is_bit_identical_for_the_same_settings() -> None:
-    one = simulate()
+def test_a_session_is_bit_identical_for_the_same_settings_and_begins_a_longer_one() -> None:
+    one, other = simulate(), simulate(seed=1)
     assert isinstance(one, Source)
     with one as source:
         first = bits(source)
         assert bits(source) == first
-    assert bits(simulate()) == first
-    assert len(first) == one.length == 150
+    again = simulate(reports=80)
+    assert bits(again)[:60] == first
+    assert len(first) == one.length == 60
     assert simulate().digest == one.digest
-    other = simulate(seed=1)
-    assert other.digest != one.digest
+    assert len({source.digest for source in (one, again, other)}) == 3
     assert bits(other)[:20] != first[:20]
 
 
-def test_a_longer_session_begins_like_a_shorter_one() -> None:
-    assert bits(simulate(reports=80)) == bits(simulate())[:80]
+def test_a_seed_gives_the_same_session_for_ever() -> None:
+    made = simulate()
+    state, moment = ("".join(str(int(one)) for one in column(made, name)) for name in ("state", "moment"))
+    assert state == 35 * "0" + "1233323233301233333333333"
+    assert moment == 34 * "0" + "13000303000013000000000000"
+    motion = made.odometry.sum(axis=0)
+    strain = np.abs(np.concatenate([step.strain for step in made.steps])).mean(axis=(0, 1))
+    np.testing.assert_allclose(made.truth[-1], [0.898759, 0.893567, -3.065888], atol=1e-6)
+    np.testing.assert_allclose(motion, [0.878438, 0, 2.39396, 31.60608], atol=1e-5)
+    np.testing.assert_allclose(strain, [0.000202554, 3.26076e-05], rtol=1e-5)
 
 
 def test_streams_are_independent() -> None:
-    base = simulate()
-    other = simulate(wheels={"noise": "bias"})
+    base, other = simulate(), simulate(wheels={"noise": "bias"})
     assert (other.odometry != base.odometry).any()
     assert (other.truth == base.truth).all()
     assert all((a.strain == b.strain).all() for a, b in zip(base.steps, other.steps, strict=True))
     elsewhere = simulate(behaviour={"turn": {"share": 0.0}})
     assert arena_text(elsewhere.arena) == arena_text(base.arena)
     assert (elsewhere.truth != base.truth).any()
-    one, two = (simulate(seed=seed, arena={"seed": 7}) for seed in (1, 2))
+    one, two = (simulate(seed=seed, arena={"seed": 7}, reports=20) for seed in (1, 2))
     assert arena_text(one.arena) == arena_text(two.arena)
-    assert (one.odometry[:20] != two.odometry[:20]).any()
+    assert (one.odometry != two.odometry).any()
 
 
 def test_the_digest_depends_on_the_configuration(tmp_path: Path) -> None:
-    base = simulate()
+    base = simulate(reports=9)
     path, again = tmp_path / "room.txt", tmp_path / "copy.txt"
     room = base.arena._replace(objects=base.arena.objects[1:])
     path.write_text(arena_text(room))
     again.write_text("# the same\n" + arena_text(room))
-    filed = simulate(arena={"file": path})
-    larger = simulate(arena={"side": 2.5})
-    sessions = [base, simulate(seed=3), simulate(whiskers={"noise": 1e-6}), filed, larger]
-    assert len({one.digest for one in sessions}) == len(sessions)
-    assert simulate(arena={"file": again}).digest == filed.digest  # the content counts, not the path
+    changes = ({"whiskers": {"noise": 1e-6}}, {"arena": {"side": 2.5}}, {"arena": {"file": path}})
+    *others, filed = (simulate(reports=9, **change) for change in changes)
+    assert len({one.digest for one in (base, *others, filed)}) == 4
+    assert (
+        simulate(reports=9, arena={"file": again}).digest == filed.digest
+    )  # the content counts, not the path
     assert str(tmp_path) not in filed.info.to_json()
     config = CreateSimulationConfig.model_validate({"arena": {"file": "room.txt"}}).resolved(tmp_path)
     assert config.arena.file == path
@@ -101,12 +109,11 @@ def test_the_digest_depends_on_the_configuration(tmp_path: Path) -> None:
 
 
 def test_samples_agree_with_the_session() -> None:
-    simulation = session(0)
+    simulation = simulate(minutes=1.0, reports=None)
     samples = list(simulation)
     assert len(samples) == simulation.length
     assert (simulation.whiskers, simulation.view_shape, simulation.info.raw_whiskers) == (4, (1, 4, 1), True)
-    assert simulation.rate_hz == pytest.approx(2.0)
-    assert samples[-1].time >= 360 > samples[-2].time
+    assert samples[-1].time >= 60 > samples[-2].time
     before = simulation.arena.start
     for sample, step in zip(samples, simulation.steps, strict=True):
         report = sample.reading
@@ -115,11 +122,8 @@ def test_samples_agree_with_the_session() -> None:
         assert report.odometry.dt == pytest.approx(step.duration)
         assert report.contact.shape == report.alive.shape == (4,)
         assert report.strain.shape == (len(report.time), 4, 2)
-        if step.state == CreateState.FWD2:
-            assert len(report.time) == round(step.duration * 2000) > 0
-            assert np.allclose(report.time, np.arange(len(report.time)) / 2000)
-        else:
-            assert len(report.time) == 0
+        assert len(report.time) == (round(step.duration * 2000) if step.state == FWD2 else 0)
+        assert np.allclose(report.time, np.arange(len(report.time)) / 2000)
         moved = between(before, sample.truth)
         assert (report.odometry.dx != 0) == (report.motion != MotionKind.TURN)
         if report.motion == MotionKind.TURN:
@@ -144,38 +148,16 @@ def test_odometry_without_noise_integrates_to_the_truth() -> None:
         assert abs(wrap(pose[2] - sample.truth[2])) < 1e-9
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_steps_follow_the_state_machine(seed: int) -> None:
-    """States follow in the order of the paper, with the right ends."""
-    simulation = session(seed)
+@pytest.mark.parametrize(("seed", "side"), [(0, 1.25), (2, 2.5)])
+def test_steps_end_as_they_should_and_the_body_stays_out_of_walls(seed: int, side: float) -> None:
+    simulation = session(seed, side, 250)
     state, moment, contact = (column(simulation, name) for name in ("state", "moment", "contact"))
-    follows = {
-        CreateState.FWD1: {
-            StepEnd.FREE: CreateState.FWD1,
-            StepEnd.HIT1: CreateState.FWD2,
-            StepEnd.ABORT: CreateState.BACK,
-        },
-        CreateState.FWD2: {StepEnd.HIT2: CreateState.BACK, StepEnd.ABORT: CreateState.BACK},
-        CreateState.BACK: {StepEnd.FREE: CreateState.TURN},
-    }
-    for now, how, then in zip(state[:-1], moment[:-1], state[1:], strict=True):
-        if now == CreateState.TURN:
-            assert then in (
-                (CreateState.TURN, CreateState.FWD1) if how == StepEnd.FREE else (CreateState.BACK,)
-            )
-        else:
-            assert follows[now][how] == then
     assert contact[moment == StepEnd.HIT1].any(axis=1).all()
-    assert not contact[(state == CreateState.FWD1) & (moment == StepEnd.FREE)].any()
+    assert not contact[(state == FWD1) & (moment == StepEnd.FREE)].any()
     durations = column(simulation, "duration")
-    assert durations[state != CreateState.FWD2].max() <= 0.5 + 1e-9
-    assert durations[state == CreateState.FWD2].max() <= 2.0 + 1e-9
+    assert durations[state != FWD2].max() <= 0.5 + 1e-9
+    assert durations[state == FWD2].max() <= 2.0 + 1e-9
     assert durations.min() > 0
-
-
-@pytest.mark.parametrize(("seed", "side"), [(0, 1.25), (1, 1.25), (2, 2.5), (3, 2.5)])
-def test_the_body_stays_out_of_walls(seed: int, side: float) -> None:
-    simulation = session(seed, side)
     assert simulation.arena.in_free_space(simulation.truth[:, :2]).all()
     room = segment_distance(wall_segments(simulation.arena), simulation.truth[:, :2]).min()
     assert room > 0.17 - 0.05 * 0.01 - 1e-6  # motion between two checks
@@ -190,16 +172,10 @@ def test_six_minutes_have_the_statistics_of_the_paper() -> None:
         state, moment = column(simulation, "state"), column(simulation, "moment")
         middle = simulation.arena.outer.mean(axis=0)
         bearing = np.unwrap(np.arctan2(*(simulation.truth[:, :2] - middle).T[::-1]))
-        slow = state == CreateState.FWD2
-        counts.append(
-            [
-                simulation.length,
-                (moment == StepEnd.HIT1).sum(),
-                (bearing[-1] - bearing[0]) / (2 * np.pi),
-                (moment[slow] == StepEnd.HIT2).mean(),
-                ((state == CreateState.TURN) & (moment == StepEnd.ABORT)).sum(),
-            ]
-        )
+        circuits = (bearing[-1] - bearing[0]) / (2 * np.pi)
+        second = (moment[state == FWD2] == StepEnd.HIT2).mean()
+        stuck = ((state == TURN) & (moment == StepEnd.ABORT)).sum()
+        counts.append([simulation.length, (moment == StepEnd.HIT1).sum(), circuits, second, stuck])
     reports, hits, circuits, seconds, stuck = np.array(counts).T
     assert 600 < reports.mean() < 760
     assert hits.min() >= 30
@@ -213,7 +189,7 @@ def test_six_minutes_have_the_statistics_of_the_paper() -> None:
 def test_dead_whiskers_never_report() -> None:
     simulation = simulate(whiskers={"dead": [0, 3]})
     assert not column(simulation, "contact")[:, [0, 3]].any()
-    assert (next(iter(simulation)).reading.alive == [False, True, True, False]).all()
+    assert next(iter(simulation)).reading.alive.tolist() == [False, True, True, False]
     alone = simulate(whiskers={"dead": [0, 1, 2, 3]})  # only the bumper
     assert not column(alone, "contact").any()
     assert (column(alone, "moment") == StepEnd.ABORT).any()
@@ -229,45 +205,21 @@ def mean_strain(report: Report) -> np.ndarray:
     return report.strain[..., 0].reshape(-1, 200, 4).mean(axis=1)
 
 
-@pytest.mark.parametrize("angle", range(20, 161, 10))
-def test_first_contact_with_a_wall_is_at_its_position(angle: int) -> None:
+@pytest.mark.parametrize(("angle", "first"), [(20, [3]), (50, [3]), (60, [1, 2]), (90, [1, 2]), (130, [0])])
+def test_first_contact_with_a_wall_is_at_its_position(angle: int, first: list[int]) -> None:
     report = into(angle)
     assert report.strain.shape == (4000, 4, 2)
     assert (report.odometry.dx, report.odometry.dt) == (0.04, 2.0)
-    first = np.abs(mean_strain(report)[0])
-    if angle <= 50:
-        assert first.argmax() == 3  # to the right
-    elif angle >= 130:
-        assert first.argmax() == 0
-    else:
-        assert first.argmax() in (1, 2)
+    level = np.abs(mean_strain(report))
+    assert level[0].argmax() in first
     # Samples are aligned at contact: strain grows from the first one.
-    assert 1.5e-4 < first.max() < 8e-4
-    level = np.abs(mean_strain(report)).max(axis=1)
-    assert level[-1] > 2 * level[0]
-
-
-@pytest.mark.parametrize("angle", [25, 50, 75])
-def test_walls_on_the_left_mirror_those_on_the_right(angle: int) -> None:
-    calm = {"noise": 0.0, "shake": {"start": 0.0, "rumble": 0.0}}
-    right, left = into(angle, whiskers=calm), into(180 - angle, whiskers=calm)
-    assert np.allclose(right.strain[..., 0], -left.strain[:, ::-1, 0], atol=1e-9)
-    # Crosstalk has a sign, droop has none.
-    even = right.strain[..., 1] - 0.08 * right.strain[..., 0]
-    assert np.allclose(even, left.strain[:, ::-1, 1] - 0.08 * left.strain[:, ::-1, 0], atol=1e-9)
-    assert (even <= 1e-12).all()
-
-
-def test_repeats_differ_less_than_angles() -> None:
-    same = np.abs(mean_strain(into(60, 1)) - mean_strain(into(60, 2))).max()
-    other = np.abs(mean_strain(into(60, 1)) - mean_strain(into(80, 2))).max()
-    assert 0 < same < 0.1 * other
+    assert 1.5e-4 < level[0].max() < 8e-4
+    assert level[-1].max() > 2 * level[0].max()
 
 
 def test_a_wall_that_cannot_be_driven_into_is_refused(refused: Callable[..., InputError]) -> None:
     for angle in (0, 180, 270):
         with pytest.raises(ValueError, match="does not drive"):
             into(angle)
-    refused(
-        lambda: into(90, behaviour={"contact": 0.9, "safety": 1.0}), "create_simulation.behaviour.contact"
-    )
+    numb = {"contact": 0.9, "safety": 1.0}
+    refused(lambda: into(90, behaviour=numb), "create_simulation.behaviour.contact")
