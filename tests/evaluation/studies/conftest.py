@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +18,8 @@ from evaluation.studies.machine import machine
 from evaluation.studies.run_job import RunRecord
 from evaluation.studies.study import Job
 
+ROOT = Path(__file__).parents[3]
+PATIENCE = 240.0
 TINY = {
     "simulation.maze": {"columns": 3, "rows": 2, "loop": 6},
     "simulation.path": {"circuits": "C"},
@@ -23,6 +29,35 @@ TINY = {
     "backend": "classic",
 }
 """Some 40 whisks."""
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    """The program in a process group of its own; it heeds the interrupts that background programs ignore."""
+    code = (
+        "import signal, sys\n"
+        "from ratslam.__main__ import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)], cwd=ROOT, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+
+
+def wait_until(ready: Callable[[], object], process: subprocess.Popen[str]) -> None:
+    """Waits until a running program has come so far."""
+    end = time.monotonic() + PATIENCE
+    while not ready():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def kill(process: subprocess.Popen[str], number: int) -> tuple[str, str]:
+    """Sends a signal to the program and its workers; its output."""
+    os.killpg(process.pid, number)
+    return process.communicate(timeout=PATIENCE)
 
 
 def record(row="", seed=0, time=100.0, error=None, varied=None, odometry=None, hash=None, **values):

@@ -1,61 +1,50 @@
-"""Studies of many networks: equal bytes however they are computed, packets of the classic backend, errors."""
+"""Studies of many networks: equal networks one by one, equal bytes however they are computed, errors."""
 
 from __future__ import annotations
 
 import csv
-import os
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from evaluation.studies.cell_study import (
-    FOLDER,
-    PARAMETERS,
-    cell_study,
-    run_cell_study,
-)
+from evaluation.studies.cell_study import FOLDER, PARAMETERS, cell_study, run_cell_study
 from evaluation.studies.executor import Executor
-from evaluation.studies.network_batch import CellSets, walk
+from evaluation.studies.network_batch import SEGMENT, CellCourse, CellSets, walk
 from evaluation.studies.study_course import expected_poses, read_course
+from ratslam.classic import pose_cells
+from ratslam.classic.config import NetworkConfig, rings, units
+from ratslam.classic.excitation_inhibition import ring_difference
+from ratslam.classic.levels import to_full_torus, window_levels
 from ratslam.cli import main
 from ratslam.runs.build_session import build_session, open_observations, read_observations
 from ratslam.runs.settings.run_config import load_config
+from tactile.base.errors import InputError
+from tactile.base.types import Odometry
+from tests.evaluation.studies.conftest import kill, start, wait_until
 
-ROOT = Path(__file__).parents[3]
 SMALL = ["sets=4", "steps=100", "chunk=2", "bins=5", "pose_cells.cells_xy=11", "pose_cells.cells_heading=12"]
-PATIENCE = 240.0
+STILL = {"truth": np.zeros((200, 3)), "in_v": np.zeros(200), "in_w": np.zeros(200)}
 
 
 @pytest.fixture
 def box(tmp_path):
-    """A configuration whose source is a trace of a random walk in a box of 1 m."""
+    """A configuration whose source is a trace of loops of some 0.3 m."""
 
-    def write(steps: int = 200, **changed: np.ndarray | None) -> Path:
-        stream = np.random.default_rng(4)
-        turn, pose, truth = 0.0, np.array([0.5, 0.5, 0.0]), []
-        speed = np.full(steps, 0.2)
-        rate = np.zeros(steps)
-        for k in range(steps):
-            turn += 0.1 * (-turn / 0.2) + 3.0 * np.sqrt(0.1) * stream.standard_normal() * 0.5
-            middle = np.arctan2(0.5 - pose[1], 0.5 - pose[0]) - pose[2]
-            outside = np.abs(pose[:2] - 0.5).max() > 0.4
-            rate[k] = 6 * np.sin(middle) if outside else turn
-            if k:
-                pose = pose + [0, 0, 0.1 * rate[k]]
-                pose = pose + 0.02 * np.array([np.cos(pose[2]), np.sin(pose[2]), 0])
-            truth.append(pose)
+    def write(**changed: np.ndarray | None) -> Path:
+        steps = np.arange(200)
+        rate = 0.6 + 0.9 * np.sin(0.13 * steps)
+        heading = np.cumsum(0.1 * rate) - 0.1 * rate[0]
+        forward = 0.02 * np.where(steps > 0, [np.cos(heading), np.sin(heading)], 0)
         columns = {
-            "in_t": 0.1 * np.arange(steps), "in_v": speed, "in_w": rate,
-            "in_flags": np.full(steps, 3), "in_view": stream.random((steps // 4, 18)).repeat(4, axis=0),
-            "truth": np.array(truth),
+            "in_t": 0.1 * steps, "in_v": np.full(200, 0.2), "in_w": rate, "in_flags": np.full(200, 3),
+            "in_view": np.random.default_rng(4).random((50, 18)).repeat(4, axis=0),
+            "truth": np.column_stack([*(0.5 + np.cumsum(forward, axis=1)), heading]),
+            "params_json": np.array('{"template_y_size": 3, "template_x_size": 6}'),
         }  # fmt: skip
-        columns["params_json"] = np.array('{"template_y_size": 3, "template_x_size": 6}')
         columns |= changed
         np.savez(tmp_path / "walk.npz", **{key: value for key, value in columns.items() if value is not None})
         path = tmp_path / "box.yaml"
@@ -69,8 +58,9 @@ def chunks(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in (folder / FOLDER).iterdir()}
 
 
-def sets_of(arguments: list[str]) -> list[str]:
-    return [part for each in arguments for part in ("--set", each)]
+def command(path: Path, assignments: list[str], output: Path) -> list[str]:
+    given = [part for each in assignments for part in ("--set", each)]
+    return ["study", "--preset", "cells", str(path), *given, "--workers", "1", "-o", str(output)]
 
 
 def test_without_noise_the_packet_follows_the_truth(box, tmp_path):
@@ -83,46 +73,29 @@ def test_without_noise_the_packet_follows_the_truth(box, tmp_path):
     assert scores["drift_heading"][0] < 0.05
     assert scores["decoding"][0] <= scores["drift"][0]
     assert not scores["reseeded"].any()
-    course = study.course
-    visited = np.bincount(course.bin, minlength=400).reshape(20, 20) > 0
+    visited = np.bincount(study.course.bin, study.course.seconds, 400).reshape(20, 20) > 0
     assert (np.isfinite(scores["maps"][0]) == visited).all()
     assert (np.nanmax(scores["maps"][0], axis=(1, 2)) > 1e-3).all()  # each cell lies on the way
 
 
-def test_expected_poses_start_in_the_middle_of_the_torus_and_keep_lengths(box):
-    course = read_course(load_config(box()), 200, False, 5, (), 0)
+def test_a_course_starts_in_the_middle_of_the_torus_and_every_position_lies_in_its_bin(box):
+    course = read_course(load_config(box()), 200, False, 7, (), 0)
     truth = np.load(box().parent / "walk.npz")["truth"]
     assert np.allclose(course.expected[0], [10, 10, 18])
     moved = np.hypot(*np.diff(course.expected[:, :2], axis=0).T) * course.config.cell_size
     assert np.allclose(moved, np.hypot(*np.diff(truth[:, :2], axis=0).T))
-    again = expected_poses(course.config, truth + [3.0, -2.0, 0.0])
-    assert np.allclose(again, course.expected)
-
-
-def test_every_position_lies_in_its_bin(box):
-    course = read_course(load_config(box()), 200, False, 7, (), 0)
-    truth = np.load(box().parent / "walk.npz")["truth"]
+    assert np.allclose(expected_poses(course.config, truth + [3.0, -2.0, 0.0]), course.expected)
     row, column = np.divmod(course.bin, 7)
     for edges, at, values in ((course.x_edges, column, truth[:, 0]), (course.y_edges, row, truth[:, 1])):
         assert (values >= edges[at] - 1e-12).all()
         assert (values <= edges[at + 1] + 1e-12).all()
 
 
-def test_a_larger_study_contains_a_smaller_one(box):
-    few, many = (cell_study(box(), [*SMALL, f"sets={sets}"]) for sets in (5, 9))
-    assert np.array_equal(many.parameters[:5], few.parameters)
-    for name, column in zip(PARAMETERS, many.parameters.T, strict=True):
-        low, high = getattr(many.plan, name)
-        assert (column >= low).all()
-        assert (column <= high).all()
-
-
 @pytest.mark.soak
 def test_views_give_the_packets_of_the_classic_backend():
     config = load_config("square", ["session.precision=float64"])
     course = read_course(config, 240, True, 5, (), 0)
-    one = [np.array([value]) for value in (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0)]
-    sets = CellSets(*one)
+    sets = CellSets(*(np.array([value]) for value in (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0)))
     tracks = list(walk(course.config, sets, course.course, course.chosen))
     packets = np.concatenate([track.pose[0] for track in tracks])
     with open_observations(config.model_copy(update={"backend": "classic"})) as (whole, source):
@@ -132,56 +105,37 @@ def test_views_give_the_packets_of_the_classic_backend():
             for one, (dx, dy, dtheta) in zip(seen, course.course.motion, strict=True)
         ]
         steps = list(build_session(whole, source).replay(rows))
-    expected = np.array([step.evidence.packet for step in steps])
     assert np.sum(course.course.energy > 0) > 10
-    assert np.abs(packets - expected).max() <= 1e-9
+    assert np.abs(packets - np.array([step.evidence.packet for step in steps])).max() <= 1e-9
 
 
-@pytest.mark.soak
-def test_bytes_do_not_depend_on_workers(box, tmp_path, monkeypatch):
-    for name in ("compilation_cache_dir", "persistent_cache_min_compile_time_secs",
-                 "persistent_cache_min_entry_size_bytes"):  # fmt: skip
-        monkeypatch.setenv(f"JAX_{name.upper()}", str(getattr(jax.config, f"jax_{name}")))
-    study = cell_study(box(), SMALL)
-    with Executor(1) as executor:
-        run_cell_study(study, tmp_path / "one", executor)
-    with Executor(2) as executor:
-        run_cell_study(study, tmp_path / "two", executor)
-    assert chunks(tmp_path / "two") == chunks(tmp_path / "one")
-
-
-def test_bytes_do_not_depend_on_interrupts(box, tmp_path):
-    study = cell_study(box(), SMALL)
-    with Executor(1) as executor:
-        scores = run_cell_study(study, tmp_path / "one", executor)
-    alone = chunks(tmp_path / "one")
-    assert len(alone) == 2
-    (tmp_path / "one" / FOLDER / sorted(alone)[0]).unlink()
+def test_an_interrupted_or_larger_study_computes_only_what_is_missing(box, tmp_path):
+    study, larger = cell_study(box(), SMALL), cell_study(box(), [*SMALL, "sets=5"])
+    assert np.array_equal(larger.parameters[:4], study.parameters)
+    for name, column in zip(PARAMETERS, larger.parameters.T, strict=True):
+        low, high = getattr(larger.plan, name)
+        assert ((column >= low) & (column <= high)).all()
     counted: list[int] = []
     with Executor(1) as executor:
-        again = run_cell_study(study, tmp_path / "one", executor, counted.append)
-    assert chunks(tmp_path / "one") == alone
-    assert counted == [2, 2]
+        scores = run_cell_study(study, tmp_path, executor)
+        before = chunks(tmp_path)
+        assert len(before) == 2
+        (tmp_path / FOLDER / sorted(before)[0]).unlink()
+        again = run_cell_study(study, tmp_path, executor, counted.append)
+        assert chunks(tmp_path) == before
+        assert counted == [2, 2]
+        more = run_cell_study(larger, tmp_path, executor)
     for name, column in scores.items():
         assert np.array_equal(column, again[name], equal_nan=True)
-
-
-def test_a_larger_study_computes_only_what_is_new(box, tmp_path):
-    with Executor(1) as executor:
-        run_cell_study(cell_study(box(), SMALL), tmp_path, executor)
-        before = chunks(tmp_path)
-        scores = run_cell_study(cell_study(box(), [*SMALL, "sets=5"]), tmp_path, executor)
     assert before.items() < chunks(tmp_path).items()
     assert len(chunks(tmp_path)) == 3
-    assert scores["maps"].shape == (5, 8, 5, 5)
+    assert more["maps"].shape == (5, 8, 5, 5)
 
 
 def test_the_program_writes_table_maps_and_pictures(box, tmp_path, capsys):
     output = tmp_path / "out"
-    assert main(["study", "--preset", "cells", str(box()), *sets_of([*SMALL, "views=true"]), "--workers", "1",
-                 "-o", str(output)]) == 0  # fmt: skip
-    text = capsys.readouterr().out
-    assert (output / "table.md").read_text().strip() in text
+    assert main(command(box(), [*SMALL, "views=true"], output)) == 0
+    assert (output / "table.md").read_text().strip() in capsys.readouterr().out
     with (output / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["set"]) for row in rows] == [0, 1, 2, 3]
@@ -193,59 +147,120 @@ def test_the_program_writes_table_maps_and_pictures(box, tmp_path, capsys):
 
 
 @pytest.mark.soak
+def test_bytes_do_not_depend_on_workers(box, tmp_path):
+    for workers in (1, 2):
+        with Executor(workers) as executor:
+            run_cell_study(cell_study(box(), SMALL), tmp_path / f"{workers}", executor)
+    assert chunks(tmp_path / "2") == chunks(tmp_path / "1")
+
+
+@pytest.mark.soak
 def test_a_killed_study_continues_with_the_same_bytes(box, tmp_path):
-    arguments = ["study", "--preset", "cells", str(box()), *sets_of([*SMALL, "sets=40"]), "--workers", "1"]
-    program = [sys.executable, "-m", "ratslam", *arguments]
-    assert subprocess.run([*program, "-o", str(tmp_path / "whole")], cwd=ROOT, check=False).returncode == 0
-    process = subprocess.Popen([*program, "-o", str(tmp_path / "cut")], cwd=ROOT, start_new_session=True)
-    end = time.monotonic() + PATIENCE
-    while not (tmp_path / "cut" / FOLDER).exists() or not chunks(tmp_path / "cut"):
-        assert process.poll() is None
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait(PATIENCE)
-    assert subprocess.run([*program, "-o", str(tmp_path / "cut")], cwd=ROOT, check=False).returncode == 0
+    whole, cut = (command(box(), [*SMALL, "sets=40"], tmp_path / name) for name in ("whole", "cut"))
+    assert main(whole) == 0
+    process = start(*cut)
+    wait_until(lambda: (tmp_path / "cut" / FOLDER).exists() and chunks(tmp_path / "cut"), process)
+    kill(process, signal.SIGKILL)
+    assert main(cut) == 0
     assert (tmp_path / "cut" / "table.csv").read_bytes() == (tmp_path / "whole" / "table.csv").read_bytes()
-    whole = chunks(tmp_path / "whole")
-    assert {name: data for name, data in chunks(tmp_path / "cut").items() if name in whole} == whole
-
-
-def still(steps: int = 200) -> dict[str, np.ndarray]:
-    return {"truth": np.zeros((steps, 3)), "in_v": np.zeros(steps), "in_w": np.zeros(steps)}
+    assert chunks(tmp_path / "whole").items() <= chunks(tmp_path / "cut").items()
 
 
 @pytest.mark.parametrize(
-    ("changed", "more", "expected"),
+    ("changed", "more", "named"),
     [
         ({}, ["sett=3"], "sett"),
-        ({}, ["excite_sigma=[1.2, 0.8]"], "lower end"),
-        ({}, ["excite_sigma=[0.0, 0.8]"], "greater than 0"),
-        ({}, ["chosen=[15876]"], "indices below 15876"),
-        ({}, ["pose_cells.cell_size=0.001"], "less than half the torus"),
+        ({}, ["excite_sigma=[1.2, 0.8]"], "excite_sigma"),
+        ({}, ["excite_sigma=[0.0, 0.8]"], "excite_sigma"),
+        ({}, ["chosen=[15876]"], "15876"),
+        ({}, ["pose_cells.cell_size=0.001"], "torus"),
         ({"truth": None}, [], "no true poses"),
+        ({"truth": np.where(np.arange(200)[:, None] == 17, np.nan, np.ones(3))}, [], "17"),
         ({"in_flags": np.full(200, 2)}, ["views=true"], "no views"),
-        (still(), [], "stays in one place"),
+        (STILL, [], "stays in one place"),
     ],
 )
-def test_bad_input_is_one_clear_error(box, tmp_path, capsys, changed, more, expected):
-    output = tmp_path / "out"
-    path = box(**changed)
-    assert main(["study", "--preset", "cells", str(path), *sets_of(more), "-o", str(output)]) == 2
-    assert expected in capsys.readouterr().err
-    assert not output.exists()
-
-
-def test_an_unknown_pose_on_the_way_is_named(box, tmp_path, capsys):
-    path = box()
-    with np.load(path.parent / "walk.npz") as found:
-        truth = found["truth"].copy()
-    truth[17] = np.nan
-    assert main(["study", "--preset", "cells", str(box(truth=truth)), "-o", str(tmp_path / "out")]) == 2
-    assert "17" in capsys.readouterr().err
+def test_unfit_settings_and_sessions_are_refused(box, changed, more, named):
+    with pytest.raises(InputError, match=named):
+        cell_study(box(**changed), more)
 
 
 @pytest.mark.parametrize("option", [["--search"], ["--error", "ate"]])
 def test_options_of_other_studies_are_refused(box, capsys, option):
     assert main(["study", "--preset", "cells", str(box()), *option]) == 2
     assert option[0] in capsys.readouterr().err
+
+
+CONFIG = NetworkConfig(cells_xy=21)
+STEPS = SEGMENT + 70
+SETS = [(0.9, 2.3, 1e-5, 1.0, 0.2, 0.1), (1.1, 1.8, 3e-5, 2.0, 0.1, 0.0), (1.0, 2.0, 2e-5, 1.0, 0.0, 0.0)]
+CHOSEN = [18 * 441 + 10 * 21 + 10, 17 * 441 + 11 * 21 + 9, 0]
+
+
+def sets() -> CellSets:
+    return CellSets(*(np.array(column) for column in zip(*SETS, strict=True)))
+
+
+def course(views: bool) -> CellCourse:
+    """A random drive; with views, templates learnt and seen again farther away than the window reaches."""
+    stream = np.random.default_rng(3)
+    motion = stream.normal(0, 0.3, (STEPS, 3)) * units(CONFIG, np.dtype(float))
+    template, novel, energy = np.zeros(STEPS, np.int32), np.zeros(STEPS, bool), np.zeros(STEPS)
+    turned = np.zeros(STEPS)
+    if views:
+        novel[[5, 20]], template[20:90] = True, 1
+        energy[[30, 31, 90, 95, 150]], turned[90] = 0.12, 9.0
+        template[150:] = 1
+    return CellCourse(motion, stream.standard_normal((STEPS, 2)), template, novel, turned, energy)
+
+
+def alone(row: tuple[float, ...], given: CellCourse) -> tuple[np.ndarray, np.ndarray]:
+    """Packets [T, 3] and activity [T, C] of one dense network, each step fed from here."""
+    excite, inhibit, threshold, factor, speed, heading = row
+    changed = {"excite_sigma": excite, "inhibit_sigma": inhibit, "global_inhibition": threshold}
+    config = CONFIG.model_copy(update=changed | {"engine": "dense"})
+    levels = window_levels(config, np.dtype(float))
+    step = jax.jit(lambda cells, *row: pose_cells.step(config, levels, cells, *row)[0])
+    cells, packet, poses, active = pose_cells.start(config, np.dtype(float)), {}, [], []
+    for motion, noise, template, novel, turned, energy in zip(*given, strict=True):
+        if novel:
+            packet[int(template)] = np.asarray(cells.pose)
+        recall = (packet.get(int(template), np.zeros(3)) + [0, 0, turned]) % rings(config, np.dtype(float))
+        faster = 1 + speed * noise[0]
+        moved = motion * [faster, faster, 1] + [0, 0, heading * noise[1]]
+        odometry = Odometry(*map(jnp.asarray, moved), jnp.ones(()))
+        cells = step(cells, odometry, jnp.asarray(recall), jnp.asarray(energy * factor))
+        poses.append(np.asarray(cells.pose))
+        active.append(np.asarray(to_full_torus(levels, cells.activity)).reshape(-1)[CHOSEN])
+    return np.array(poses), np.array(active)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("views", [True, False])
+def test_networks_equal_those_simulated_one_by_one(views):
+    """With three networks in blocks of two."""
+    given = course(views)
+    segments = list(walk(CONFIG, sets(), given, CHOSEN, block=2))
+    assert [segment.pose.shape[1] for segment in segments] == [SEGMENT, STEPS - SEGMENT]
+    pose, activity, _, level = (np.concatenate(each, axis=1) for each in zip(*segments, strict=True))
+    assert bool(level.max()) == views
+    for k, row in enumerate(SETS):
+        expected, active = alone(row, given)
+        gap = ring_difference(pose[k] - expected, np.array([[21, 21, 36]]))
+        assert np.abs(gap).max() <= 1e-9
+        assert np.abs(activity[k] - active).max() <= 1e-12
+    assert activity[:, :, 0].max() > 1e-3
+
+
+def test_networks_that_left_the_smallest_window_go_back_to_it():
+    motion = np.tile([0.02, 0.0, 0.01], (12 * SEGMENT, 1))
+    steps = len(motion)
+    template, energy = np.zeros(steps, np.int32), np.zeros(steps)
+    novel = np.arange(steps) == 0
+    template[-1] = 1  # as many as in `course`, so that nothing compiles again
+    energy[200] = 0.05
+    given = CellCourse(motion, np.zeros((steps, 2)), template, novel, np.zeros(steps), energy)
+    level = np.concatenate([track.level for track in walk(CONFIG, sets(), given, CHOSEN, block=2)], axis=1)
+    assert (level[:, 200] > 0).all()
+    assert not level[:, :200].any()
+    assert not level[:, -SEGMENT:].any()

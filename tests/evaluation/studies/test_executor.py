@@ -56,29 +56,19 @@ def test_one_worker_is_this_process():
     assert found == [(value, os.getpid()) for value in (3, 1, 2)]
 
 
-def test_no_tasks_give_no_results():
-    assert list(run_tasks(square, [], workers=2)) == []
-
-
-def test_several_processes_keep_the_order_and_repeat_what_is_killed(tmp_path):
+def test_several_processes_keep_the_order_repeat_what_is_killed_and_end(tmp_path):
     tasks = [str(tmp_path / name) for name in "abcd"]
     for name in (tasks[0], *tasks[2:]):
         Path(name).touch()
     found = list(run_tasks(die_once, tasks, workers=2))
     assert len(found) == 4
     assert os.getpid() not in found
-    assert not multiprocessing.active_children()
-
-
-def test_results_keep_the_order_of_the_tasks_and_abandoned_processes_end():
+    assert list(run_tasks(square, [], workers=2)) == []
     with closing(run_tasks(wait, [0.5, 0.0, 600.0], workers=2)) as results:
         assert [next(results), next(results)] == [0.5, 0.0]
-    assert not multiprocessing.active_children()
-
-
-def test_errors_of_tasks_come_out_of_other_processes():
     with pytest.raises(InputError, match=r"a\.b: 5; expected another value"):
         list(run_tasks(fail, [5, 5], workers=2))
+    assert not multiprocessing.active_children()
 
 
 def test_a_fresh_executor_runs_each_task_in_a_new_process_and_survives_a_kill():

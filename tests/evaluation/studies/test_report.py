@@ -13,15 +13,9 @@ from hypothesis import strategies as st
 
 from evaluation.metrics.run_metrics import recognition_error
 from evaluation.metrics.statistics import pareto_optimal
-from evaluation.studies.metrics import COLUMNS, METRICS, find_error
+from evaluation.studies.metrics import find_error
 from evaluation.studies.study import StudyPlan
-from evaluation.studies.study_report import (
-    label,
-    make_report,
-    render,
-    save_report,
-    spread,
-)
+from evaluation.studies.study_report import label, make_report, render, save_report, spread
 from tactile.base.errors import InputError
 from tests.evaluation.studies.conftest import record
 
@@ -46,14 +40,6 @@ def test_the_optimal_rows_are_those_that_no_other_dominates(costs):
     assert pareto_optimal(costs).any() == bool(known)
 
 
-@given(COSTS, st.permutations(range(8)))
-def test_neither_order_nor_scale_changes_what_is_optimal(costs, order):
-    best, order = pareto_optimal(costs), [k for k in order if k < len(costs)]
-    assert (pareto_optimal(costs[order]) == best[order]).all()
-    assert (pareto_optimal(np.exp(costs)) == best).all()
-    assert pareto_optimal(costs[best]).all()
-
-
 @given(
     st.lists(st.one_of(st.none(), FINITE), max_size=9), st.sampled_from(["energy_all", "exm_arr", "links"])
 )
@@ -70,15 +56,6 @@ def test_statistics_use_the_defined_values(values, name):
     assert found.worst == {"energy_all": max(known), "exm_arr": min(known), "links": None}[name]
 
 
-def test_every_column_is_a_quantity():
-    assert {name for names in COLUMNS.values() for name in names} <= set(METRICS)
-
-
-def test_an_error_has_a_short_and_a_full_name():
-    assert find_error("em") == find_error("energy_all") == "energy_all"
-    assert find_error("exm") == "recognition_error"
-
-
 def test_recognition_is_without_error_if_all_steps_and_all_relocalisations_are():
     def error(**values):
         return recognition_error(record(**values).quantities).value
@@ -88,11 +65,13 @@ def test_recognition_is_without_error_if_all_steps_and_all_relocalisations_are()
     assert np.isnan(error(exm_arr=0.5, exm_arcr_strict=None))
 
 
-@pytest.mark.parametrize("name", ["atee", "step_time", "experiences", ""])
-def test_an_unknown_error_is_refused(name):
-    with pytest.raises(InputError, match="--error") as caught:
-        find_error(name)
-    assert ("did you mean 'ate'" in str(caught.value)) == (name == "atee")
+def test_an_error_has_a_short_and_a_full_name_and_an_unknown_one_is_refused():
+    assert find_error("em") == find_error("energy_all") == "energy_all"
+    assert find_error("exm") == "recognition_error"
+    for name in ("atee", "step_time", "experiences", ""):
+        with pytest.raises(InputError, match="--error") as caught:
+            find_error(name)
+        assert ("'ate'" in str(caught.value)) == (name == "atee")
 
 
 def test_the_default_error_is_the_first_that_all_rows_have():
@@ -195,10 +174,8 @@ def test_differences_are_from_the_first_row_and_odometry_comes_last():
     assert "9" in last.split()
     assert "1 of 2 rows (50%) end at an ATE of 2.5 m or less" in report.remarks[-1]
     assert "2 of 2" in make_report("name", plan("differences", limit=3.0), rows).remarks[-1]
-    assert (
-        "without true poses"
-        in make_report("name", plan("differences"), [record("a"), record("b")]).remarks[-1]
-    )
+    blind = make_report("name", plan("differences"), [record("a"), record("b")])
+    assert "without true poses" in blind.remarks[-1]
 
 
 def test_disturbances_of_a_measurement_are_remarked_on():
@@ -210,12 +187,8 @@ def test_disturbances_of_a_measurement_are_remarked_on():
     assert "disturb" in make_report("name", plan(), [shared]).remarks[0]
 
 
-def test_labels_are_as_short_as_possible():
-    assert label("", {}) == "as configured"
-    assert label("a", {}) == "a"
+def test_labels_are_short_and_different_values_different_rows():
+    assert [label("", {}), label("a", {})] == ["as configured", "a"]
     assert label("a", {"x.k": "v", "y.l": 1.5}) == "a k=v l=1.5"
     assert label("", {"x.k": 1, "y.k": [2]}) == "x.k=1 y.k=[2]"
-
-
-def test_two_values_with_equal_labels_are_two_rows():
-    assert len(make_report("name", plan("means"), [record(varied={"k": k}) for k in (1, "1")]).rows) == 2
+    assert len(make_report("name", plan(), [record(varied={"k": k}) for k in (1, "1")]).rows) == 2

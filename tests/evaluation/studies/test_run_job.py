@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import jax
@@ -18,7 +17,6 @@ from ratslam.mapping.config import FULL
 from ratslam.runs.run import run
 from robot.recordings.mcap_writer import record_source
 from robot.recordings.npz_trace import read_trace
-from tactile.base.errors import InputError
 
 ROOT = Path(__file__).parents[3]
 SMALL = {"simulation.path": {"circuits": "CC"}}
@@ -40,28 +38,24 @@ def test_a_job_has_the_quantities_of_a_run(tiny, tmp_path, backend):
     assert (result.row, result.seed, result.error) == ("", 3, None)
 
 
-def test_a_job_measures_steps_compilation_and_memory(tiny):
-    (job,) = read_study(tiny(set=SMALL)).jobs
-    result = run_job(job)
-    step, compiling = result.value("step_time"), result.value("compile_time")
-    assert 0 < step <= result.value("step_time_p99")
-    assert step < 1.2 * result.value("run_time")
-    assert compiling > 100e-6 * step  # not hidden among the steps
-    assert result.value("memory") > 100
-    assert result.machine.versions["jax"] == jax.__version__
-    assert all(result.value(metric.name) > 0 for metric in MEASURED)
-
-
-def test_pace_and_earlier_jobs_change_no_quantity(tiny):
-    vary = {"session.precision": ["float32", "float64"]}
-    single, double = read_study(tiny(vary=vary)).jobs
-    (live, _) = read_study(tiny(vary=vary, pace="live")).jobs
-    first, before = run_job(single), jax.config.jax_enable_x64
-    wide = run_job(double)
-    stepwise = run_job(live)
+def test_pace_and_earlier_jobs_change_no_quantity_and_a_perturbed_copy_is_another_session(tiny):
+    vary, before = {"session.precision": ["float32", "float64"]}, jax.config.jax_enable_x64
+    single, double = read_study(tiny(set=SMALL, vary=vary)).jobs
+    (live, _) = read_study(tiny(set=SMALL, vary=vary, pace="live")).jobs
+    (copy, _) = read_study(tiny(set=SMALL, vary=vary, copies=1)).jobs
+    first, wide, stepwise, perturbed = map(run_job, (single, double, live, copy))
     assert first.quantities == stepwise.quantities
     assert first.quantities != wide.quantities or first.source == wide.source
     assert jax.config.jax_enable_x64 == before
+    assert perturbed.source == f"{first.source}+1"
+    assert perturbed.quantities["ate_final"].odometry != first.quantities["ate_final"].odometry
+    step, compiling = first.value("step_time"), first.value("compile_time")
+    assert 0 < step <= first.value("step_time_p99")
+    assert step < 1.2 * first.value("run_time")
+    assert compiling > 100e-6 * step  # not hidden among the steps
+    assert first.value("memory") > 100
+    assert first.machine.versions["jax"] == jax.__version__
+    assert all(first.value(metric.name) > 0 for metric in MEASURED)
 
 
 @pytest.mark.soak
@@ -91,19 +85,27 @@ def test_every_quantity_of_the_scorecards_is_known(tiny, tmp_path):
     assert maps - {"map_error", "map_doubt"} == {metric.name for metric in GRID_METRICS}
 
 
-def test_input_errors_are_results(tiny):
+def test_input_errors_are_results_and_other_errors_are_raised(tiny, tmp_path, monkeypatch):
     (job,) = read_study(tiny(set={"simulation.maze": {"file": "nowhere.txt"}})).jobs
     result = run_job(job)
     assert "nowhere.txt" in result.error
-    assert result.quantities == {}
-    assert result.value("energy_all") is None
+    assert (result.quantities, result.value("energy_all")) == ({}, None)
+    record_source(read_trace(ROOT / "tests" / "golden" / "a_square3.npz"), tmp_path / "a.mcap")
+    (tmp_path / "base.yaml").write_text("recording: {file: a.mcap}\n")
+    (tmp_path / "study.yaml").write_text("base: base.yaml\ncopies: 1\n")
+    (job,) = read_study(tmp_path / "study.yaml").jobs
+    assert "streamed" in run_job(job).error
+    given = []
 
+    def build_session(config, source, ablation):
+        given.append(ablation)
+        raise ZeroDivisionError
 
-def test_other_errors_are_raised(tiny, monkeypatch):
-    monkeypatch.setattr("evaluation.studies.run_job.build_session", lambda *_: 1 / 0)
-    (job,) = read_study(tiny()).jobs
-    with pytest.raises(ZeroDivisionError):
-        run_job(job)
+    monkeypatch.setattr("evaluation.studies.run_job.build_session", build_session)
+    for job in read_study(tiny(rows={"plain": {}, "off": {"ablation": {"verify": False}}})).jobs:
+        with pytest.raises(ZeroDivisionError):
+            run_job(job)
+    assert given == [FULL, FULL.model_copy(update={"verify": False})]
 
 
 def test_a_stopwatch_separates_compilation_from_steps(monkeypatch):
@@ -124,33 +126,6 @@ def test_a_stopwatch_separates_compilation_from_steps(monkeypatch):
     assert result["run_time"] == pytest.approx((now[0] - 18.0) * 1e6 / 80)
 
 
-def test_a_stopwatch_counts_compilations_of_jax():
-    watch = Stopwatch()
-    with watch.taking(1):
-        jax.jit(lambda x: x * math.pi + 1)(1.0).block_until_ready()
-    compiled = jax.jit(lambda x: x - 1)
-    for _ in range(3):
-        with watch.taking(1):
-            compiled(1.0).block_until_ready()
-    times = watch.times()
-    assert 0 < 1e-6 * times["step_time"] < times["compile_time"]
-
-
-def test_a_perturbed_copy_is_another_session(tiny):
-    plain, copy = read_study(tiny(rows={"plain": {}, "copy": {"copies": 1}})).jobs
-    first, second = run_job(plain), run_job(copy)
-    assert second.source == f"{first.source}+1"
-    assert second.quantities["ate_final"].odometry != first.quantities["ate_final"].odometry
-
-
-def test_a_streamed_recording_is_not_perturbed(tmp_path):
-    record_source(read_trace(ROOT / "tests" / "golden" / "a_square3.npz"), tmp_path / "a.mcap")
-    (tmp_path / "base.yaml").write_text("recording: {file: a.mcap}\n")
-    (tmp_path / "study.yaml").write_text("base: base.yaml\ncopies: 1\n")
-    (job,) = read_study(tmp_path / "study.yaml").jobs
-    assert "streamed" in run_job(job).error
-
-
 def test_closures_true_and_false_are_counted(tmp_path):
     (tmp_path / "study.yaml").write_text(f"base: {ROOT}/configs/square.yaml\n")
     (job,) = read_study(tmp_path / "study.yaml").jobs
@@ -160,17 +135,3 @@ def test_closures_true_and_false_are_counted(tmp_path):
     assert found.value("false_closures") == 0
     assert found.value("anytime_median") < found.quantities["ate_final"].odometry
     assert found.value("lost_share") < 0.5
-
-
-def test_an_ablation_reaches_the_session(tiny, monkeypatch):
-    given = []
-
-    def build_session(config, source, ablation):
-        given.append(ablation)
-        raise InputError("a", "b", "c")
-
-    monkeypatch.setattr("evaluation.studies.run_job.build_session", build_session)
-    rows = {"plain": {}, "off": {"ablation": {"verify": False}}}
-    for job in read_study(tiny(rows=rows)).jobs:
-        run_job(job)
-    assert given == [FULL, FULL.model_copy(update={"verify": False})]

@@ -1,13 +1,13 @@
-"""Runs of a study: none is lost or repeated, and the outcome does not depend on the process."""
+"""Runs of a study or a search: none is lost or repeated, and the outcome does not depend on the process."""
 
 from __future__ import annotations
 
+import json
 import os
 import signal
-import subprocess
 import sys
 import time
-from pathlib import Path
+from dataclasses import replace
 
 import psutil
 import pytest
@@ -15,21 +15,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.studies.executor import Executor
+from evaluation.studies.metrics import MEASURED
+from evaluation.studies.parameter_search import search
 from evaluation.studies.run_job import FILE, KILLED, RunLog, measure_jobs, run_jobs
 from evaluation.studies.study import read_study
+from evaluation.studies.study_report import make_report
 from ratslam.cli import main
-from tests.evaluation.studies.conftest import record
+from tactile.base.errors import InputError
+from tests.evaluation.studies.conftest import PATIENCE, kill, record, start, wait_until
 
-ROOT = Path(__file__).parents[3]
-PATIENCE = 240.0
-
-
-def start(study, output, *more):
-    """The program in a process group of its own."""
-    command = [sys.executable, "-m", "ratslam", "study", str(study), "-o", str(output), *more]
-    return subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+FULL = record("r", varied={"a.b": [1, {"c": None}]}, time=40.0, energy_all=0.1 + 0.2, exm_arr=None)
 
 
 def lines(output):
@@ -38,21 +33,11 @@ def lines(output):
     return path.read_bytes().splitlines(keepends=True) if path.exists() else []
 
 
-def wait_for(count, output, process):
-    """Waits until there are that many records."""
-    end = time.monotonic() + PATIENCE
-    while len(lines(output)) < count:
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
-def wait_for_end(group):
-    """Waits until all processes of a group have ended."""
-    end = time.monotonic() + PATIENCE
-    while members(group):
-        assert time.monotonic() < end
-        time.sleep(0.05)
+def start_study(study, output, *more, records):
+    """The program that runs a study, when it has as many records."""
+    process = start("study", study, "-o", output, *more)
+    wait_until(lambda: len(lines(output)) >= records, process)
+    return process
 
 
 def members(group):
@@ -67,6 +52,14 @@ def members(group):
     return found
 
 
+def wait_for_end(group):
+    """Waits until all processes of a group have ended."""
+    end = time.monotonic() + PATIENCE
+    while members(group):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
 def run(jobs, folder, workers=1, done=None):
     with Executor(workers) as executor:
         return list(run_jobs(jobs, RunLog(folder), executor, done))
@@ -77,24 +70,45 @@ def outcomes(records):
     return [(each.key, each.row, each.varied, each.steps, each.source, each.quantities) for each in records]
 
 
-@pytest.mark.soak
-def test_two_workers_give_what_one_process_gives(tiny, tmp_path):
-    jobs = read_study(tiny(seeds=2)).jobs
-    alone = run(jobs, tmp_path / "alone")
-    shared = run(jobs, tmp_path / "shared", workers=2)
-    assert outcomes(shared) == outcomes(alone)
-    assert {each.machine.workers for each in shared} == {2}
+def test_records_read_back_equal_and_the_last_of_a_run_counts(tmp_path):
+    copy, later = FULL.model_copy(update={"copy_number": 2}), FULL.model_copy(update={"steps": 7})
+    log = RunLog(tmp_path / "new" / "folder")
+    for each in (FULL, copy, later):
+        log.append(each)
+    assert RunLog(tmp_path / "new" / "folder").records == {FULL.key: later, copy.key: copy}
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(InputError, match="cannot be made"):
+        RunLog(tmp_path / "file" / "below")
+
+
+@pytest.mark.parametrize("content", [b"", b'{"hash": "a", "se', b"{}", b"\xff\xfe", b"[1]", b"\n\n"])
+def test_a_malformed_line_is_skipped_and_the_next_is_complete(tmp_path, content):
+    (tmp_path / FILE).write_bytes(content)
+    log = RunLog(tmp_path)
+    assert log.records == {}
+    log.append(FULL)
+    assert RunLog(tmp_path).records == {FULL.key: FULL}
+
+
+def test_every_value_has_a_name():
+    names = (
+        "step_time",
+        "step_time_p99",
+        "compile_time",
+        "run_time",
+        "memory",
+        "energy_all",
+        "exm_arr",
+        "map_auc",
+    )
+    assert [FULL.value(name) for name in names] == [40, 80, 1, 120, 400, 0.1 + 0.2, None, None]
 
 
 def test_a_study_killed_by_sigkill_runs_only_what_is_missing(tiny, tmp_path, stubbed):
     """The killed program runs sessions; the one that continues only notes what it would run."""
     study, output = tiny(seeds=40), tmp_path / "out"
-    process = start(study, output, "--workers", "1")
-    wait_for(2, output, process)
-    process.kill()
-    process.communicate()
-    kept = RunLog(output).records
-    before = lines(output)
+    kill(start_study(study, output, "--workers", "1", records=2), signal.SIGKILL)
+    kept, before = RunLog(output).records, lines(output)
     assert 2 <= len(kept) < 40
     jobs = read_study(study).jobs
     done: list[str] = []
@@ -144,89 +158,54 @@ def test_lost_records_are_run_again_and_nothing_else(data, scores, tmp_path_fact
 
 
 def test_failed_runs_are_reported_and_the_others_continue(tiny, tmp_path, capsys, stubbed):
-    study = tiny(vary={"keyframes.min_score": [5, 41, 6]}, seeds=2)
+    study, output = tiny(vary={"keyframes.min_score": [5, 41, 6]}, seeds=2), tmp_path / "out"
     for _ in range(2):  # the second time nothing runs, and the failure is reported again
-        assert main(["study", str(study), "-o", str(tmp_path / "out"), "--workers", "1"]) == 2
+        assert main(["study", str(study), "-o", str(output), "--workers", "1"]) == 2
         printed = capsys.readouterr()
         assert "min_score=41, seed 1: keyframes.min_score: too much" in printed.err
         assert "2 runs failed" in printed.err
         assert "min_score=6" in printed.out
         assert "0, 2 failed" in printed.out
-        assert (tmp_path / "out" / "table.csv").exists()
+        assert (output / "table.csv").exists()
     assert len(stubbed) == 6
-
-
-def test_killed_runs_are_reported_and_tried_again(tiny, tmp_path, monkeypatch):
-    jobs = read_study(tiny(seeds=2)).jobs
-    monkeypatch.setattr(
-        Executor,
-        "completed",
-        lambda self, function, tasks, killed: ((k, killed(t)) for k, t in enumerate(tasks)),
-    )
-    assert [each.error for each in run(jobs, tmp_path / "out")] == [KILLED, KILLED]
-    assert not RunLog(tmp_path / "out").records
-
-
-def test_records_of_other_code_are_remarked_on(tiny, tmp_path, capsys, stubbed):
-    study, output = tiny(seeds=2), tmp_path / "out"
-    assert main(["study", str(study), "-o", str(output), "--workers", "1"]) == 0
-    assert "builds" not in capsys.readouterr().out
     (output / FILE).write_text((output / FILE).read_text().replace('"build":"', '"build":"0', 1))
-    assert main(["study", str(study), "-o", str(output), "--workers", "1"]) == 0
-    assert "2 builds of ratslam" in capsys.readouterr().out
+    assert main(["study", str(study), "-o", str(output), "--workers", "1"]) == 2
+    assert "2 builds" in capsys.readouterr().out
 
 
-@pytest.mark.soak
-def test_speed_is_measured_in_fresh_processes_and_is_not_measured_again(tiny, tmp_path, capsys):
-    study, output = tiny(seeds=2, report="pareto", pace="live"), tmp_path / "out"
-    assert main(["study", str(study), "-o", str(output)]) == 0
-    records = list(RunLog(output).records.values())
-    assert [each.seed for each in records] == [0, 1]
-    for each in records:
-        assert each.error is None
-        assert each.machine.workers == 1
-    assert {each.name for each in output.iterdir()} == {
-        FILE,
-        "table.csv",
-        "table.json",
-        "table.md",
-        "pareto.png",
-    }
-    kept = lines(output)
-    first = capsys.readouterr().out
-    assert main(["study", str(study), "-o", str(output)]) == 0
-    assert capsys.readouterr().out == first
-    assert main(["study", str(study), "-o", str(output), "--error", "ate"]) == 0
-    assert "ATE, final" in capsys.readouterr().out
-    assert lines(output) == kept
-
-
-def test_speed_is_measured_seed_by_seed_with_kernels_apart(tiny, tmp_path, monkeypatch):
-    requested = []
+def completed_by_kills(requested, kernels):
+    """Replaces `Executor.completed`: every task is killed."""
 
     def completed(self, function, tasks, killed):
         requested.extend(tasks)
-        kernels.append(function.args)
+        kernels.append(function)
         return ((k, killed(task)) for k, task in enumerate(tasks))
 
-    kernels = []
-    monkeypatch.setattr(Executor, "completed", completed)
+    return completed
+
+
+def test_killed_runs_are_reported_and_tried_again(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(Executor, "completed", completed_by_kills([], []))
+    assert [each.error for each in run(read_study(tiny(seeds=2)).jobs, tmp_path)] == [KILLED, KILLED]
+    assert not RunLog(tmp_path).records
+
+
+def test_speed_is_measured_seed_by_seed_with_kernels_apart(tiny, tmp_path, monkeypatch):
+    requested, functions = [], []
+    monkeypatch.setattr(Executor, "completed", completed_by_kills(requested, functions))
     rows = {"a": {}, "b": {"session.precision": "float32"}, "twin": {}}
-    jobs = read_study(tiny(rows=rows, seeds=2)).jobs
-    found = measure_jobs(jobs, RunLog(tmp_path / "out"))
+    found = measure_jobs(read_study(tiny(rows=rows, seeds=2)).jobs, RunLog(tmp_path))
     assert [(job.row, job.seed) for job in requested] == [("a", 0), ("b", 0), ("a", 1), ("b", 1)]
-    assert len(kernels) == 1
+    assert [set(function.keywords) for function in functions] == [{"kernels"}]
     assert [each.row for each in found] == ["a", "a", "b", "b", "twin", "twin"]
 
 
 @pytest.mark.soak
 def test_an_interrupt_keeps_finished_runs_and_ends_all_processes(tiny, tmp_path):
     study, output = tiny(seeds=300), tmp_path / "out"
-    for count in (2, 6):
-        process = start(study, output, "--workers", "2")
-        wait_for(count, output, process)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-        _, error = process.communicate(timeout=PATIENCE)
+    for records in (2, 6):
+        process = start_study(study, output, "--workers", "2", records=records)
+        _, error = kill(process, signal.SIGINT)  # as a terminal does
         assert process.returncode == 130
         assert "Traceback" not in error
         assert "the same command continues" in error
@@ -234,16 +213,145 @@ def test_an_interrupt_keeps_finished_runs_and_ends_all_processes(tiny, tmp_path)
     assert main(["study", str(study), "-o", str(output), "--workers", "2"]) == 0
 
 
+TUNE = {
+    "trials": 14,
+    "parameters": {
+        "keyframes.min_score": {"low": 1.0, "high": 39.0, "log": True},
+        "recall.guard": {"low": 1, "high": 8},
+        "session.precision": {"choices": ["float32", "float64"]},
+    },
+    "objectives": ["energy_all", "exm_arr"],
+}
+
+
+class Killed(Exception):
+    """Stands for SIGKILL in this process."""
+
+
+def tune(study, folder, done=None):
+    """The trials: rows of the report of a search."""
+    with Executor(1) as executor:
+        records = search(study, RunLog(folder), executor, done)
+    return make_report(study.name, study.plan, records, search=True).rows
+
+
+def mean(trial, name="energy_all"):
+    return trial.spreads[name].mean
+
+
+def dominates(a, b):
+    """Low values of energy_all and high ones of exm_arr are better."""
+    values = [(mean(trial), -mean(trial, "exm_arr")) for trial in (a, b)]
+    return all(x <= y for x, y in zip(*values, strict=True)) and values[0] != values[1]
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "nsga2"])
+def test_trials_are_within_bounds_and_the_optimal_ones_are_not_dominated(tiny, tmp_path, stubbed, sampler):
+    plan = TUNE | {"sampler": sampler, "population": 4, "batch": 3}
+    trials = tune(read_study(tiny(tune=plan, seeds=2)), tmp_path / "out")
+    assert [trial.row for trial in trials] == [f"trial {number}" for number in range(14)]
+    for trial in trials:
+        score = trial.varied["keyframes.min_score"]
+        assert 1 <= score <= 39
+        assert trial.varied["recall.guard"] in range(1, 9)
+        assert mean(trial) == pytest.approx((score - 7) ** 2 + 0.5)
+        assert trial.optimal == (not any(dominates(other, trial) for other in trials))
+    different = {json.dumps(trial.varied) for trial in trials}
+    assert len(different) > 8
+    assert len(stubbed) == len(set(stubbed)) == 2 * len(different)
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "nsga2"])
+@pytest.mark.parametrize("kills", [[1], [2, 3, 5]])
+def test_a_killed_search_continues_as_if_uninterrupted(tiny, tmp_path, stubbed, sampler, kills):
+    study = read_study(tiny(tune=TUNE | {"sampler": sampler, "population": 4}))
+    whole = tune(study, tmp_path / "whole")
+    every = list(stubbed)
+    stubbed.clear()
+    for count in kills:
+        limit = len(stubbed) + count
+
+        def done(record, limit=limit):
+            if len(stubbed) >= limit:
+                raise Killed
+
+        with pytest.raises(Killed):
+            tune(study, tmp_path / "out", done)
+    assert tune(study, tmp_path / "out") == whole
+    assert sorted(stubbed) == sorted(every)  # no run twice
+
+
+def test_more_trials_continue_a_search_and_another_seed_makes_another(tiny, tmp_path, stubbed):
+    few, more, other = (
+        [
+            replace(trial, optimal=False)
+            for trial in tune(read_study(tiny(tune=TUNE | plan)), tmp_path / "out")
+        ]
+        for plan in ({"trials": 8}, {"trials": 12}, {"trials": 4, "seed": 1})
+    )
+    assert more[:8] == few
+    assert len(more) == 12
+    assert len(stubbed) <= 12 + 4
+    assert other[0].varied != more[0].varied
+
+
+def test_a_failed_run_fails_its_trial_alone(tiny, tmp_path, stubbed):
+    plan = TUNE | {"parameters": {"keyframes.min_score": {"low": 20.0, "high": 60.0}}}
+    trials = tune(read_study(tiny(tune=plan)), tmp_path / "out")
+    assert {trial.failed for trial in trials} == {0, 1}
+    for trial in trials:
+        assert trial.failed == (trial.varied["keyframes.min_score"] > 40)
+        assert not (trial.failed and trial.optimal)
+
+
+def test_a_missing_optuna_is_reported(tiny, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(InputError, match=r"ratslam\[sweep\]"):
+        tune(read_study(tiny(tune=TUNE)), tmp_path / "out")
+
+
+def test_the_program_lists_the_optimal_trials(tiny, tmp_path, capsys, stubbed):
+    output = tmp_path / "out"
+    command = ["study", str(tiny(tune=TUNE | {"minimise": ["steps"]})), "-o", str(output)]
+    command += ["--workers", "1", "--search"]
+    assert main(command) == 2
+    assert "14 trials, 0 of them Pareto-optimal" in capsys.readouterr().out  # no `steps` in stubs
+    tiny(tune=TUNE)
+    assert main(command) == 0
+    lines = capsys.readouterr().out.splitlines()
+    trials = json.loads((output / "table.json").read_text())["rows"]
+    best = [trial["row"] for trial in trials if trial["optimal"]]
+    assert any(f"14 trials, {len(best)} of them Pareto-optimal" in line for line in lines)
+    assert [line.strip("| *").partition(" min_score")[0] for line in lines[2 : 2 + len(best)]] == best
+
+
 @pytest.mark.soak
 def test_studies_killed_at_any_moment_continue(tiny, tmp_path):
+    """Workers end without the program, and two of them give what one process gives."""
     study, output = tiny(seeds=30), tmp_path / "out"
     jobs = read_study(study).jobs
     expected = outcomes(run(jobs, tmp_path / "whole"))
-    for count in (0, 1, 2, 5, 13, 21):
-        process = start(study, output, "--workers", "2")
-        if count:
-            wait_for(count, output, process)
+    for records in (0, 1, 2, 5, 13, 21):
+        process = start_study(study, output, "--workers", "2", records=records)
         process.kill()
         process.communicate()
         wait_for_end(process.pid)
     assert outcomes(run(jobs, output, workers=2)) == expected
+
+
+@pytest.mark.soak
+def test_a_search_killed_repeatedly_has_the_same_result(tiny, tmp_path):
+    plan = TUNE | {"trials": 10, "parameters": {"keyframes.min_score": {"low": 2.0, "high": 30.0}}}
+    study, output = tiny(tune=plan, set={"backend": "recall"}), tmp_path / "out"
+    timed = {metric.name for metric in MEASURED}
+
+    def unmeasured(folder):
+        return [
+            (trial.row, trial.varied, {k: v for k, v in trial.spreads.items() if k not in timed})
+            for trial in tune(read_study(study), folder)
+        ]
+
+    for records in (1, 3, 6):
+        kill(start_study(study, output, "--search", "--workers", "2", records=records), signal.SIGKILL)
+    assert unmeasured(output) == unmeasured(tmp_path / "whole")
+    assert len(lines(output)) == 10

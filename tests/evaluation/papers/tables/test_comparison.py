@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -226,28 +227,25 @@ def test_a_file_keeps_other_sessions_with_the_code_that_measured_them(tmp_path: 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (None, "no touch.csv in it; expected a folder with the touch.csv of an earlier run; name the folder"),
-        ("", "none of the 1 sessions to be measured (clean 31100), but no session; expected a run of the"),
-        ("row,session,code,em\nclean,31101,c,1.0\n", "(clean 31100), but clean 31101; expected a run of"),
-        ("t,x\n1,2\n", "touch.csv:2: malformed (without 'row'); expected a file of sessions"),
-        ("row,session,code,em\nclean,31100,c,high\n", "touch.csv:2: malformed (could not convert string"),
-        ("row,session,code,em\nclean,31100\n", "touch.csv:2: malformed (cells that are missing, or too"),
-        ("row,session,code\nclean,31100,c\nclean,31100,c\n", "touch.csv:3: malformed (session clean 31100"),
+        (None, "no touch.csv in it"),
+        ("", "clean 31100.* no session"),
+        ("row,session,code,em\nclean,31101,c,1.0\n", "clean 31100.* but clean 31101"),
+        ("t,x\n1,2\n", "touch.csv:2: malformed"),
+        ("row,session,code,em\nclean,31100,c,high\n", "touch.csv:2: malformed"),
+        ("row,session,code,em\nclean,31100\n", "touch.csv:2: malformed"),
+        ("row,session,code\nclean,31100,c\nclean,31100,c\n", "touch.csv:3: malformed"),
     ],
 )
-def test_a_folder_that_cannot_be_compared_is_one_error(
-    text: str | None, said: str, tmp_path: Path, capsys, monkeypatch
-) -> None:
+def test_a_folder_that_cannot_be_compared_is_refused(text, said, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(touch, "run_tasks", lambda *_, **__: pytest.fail("work"))
     command = ["reproduce", "tables", "touch", "--rows", "clean", "--sessions", "1", "--against"]
     if text is not None:
         (tmp_path / "touch.csv").write_text(text)
     assert main([*command, str(tmp_path)]) == 2
-    assert f"ratslam: error: {tmp_path}" in (error := capsys.readouterr().err)
-    assert said in error
-    assert error.count("\n") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(said, line)
     assert main([*command, str(tmp_path / "none")]) == 2
-    assert "none: no such folder; expected a folder with the touch.csv" in capsys.readouterr().err
+    assert "none: no such folder" in capsys.readouterr().err
 
 
 def test_a_file_of_an_earlier_run_or_of_others_is_not_written_over(tmp_path: Path, monkeypatch) -> None:

@@ -1,22 +1,22 @@
-"""The tables of results: rows as Markdown, selection of rows, recordings that are missing, the command."""
+"""The tables of results: rows as Markdown, selection of rows, missing recordings, regressions."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from evaluation.papers.tables import batches, buildings, cycles, recordings
+from evaluation.papers.tables import buildings, closures, health, recordings
 from evaluation.papers.tables import grid_table as grid
 from evaluation.papers.tables import touch_table as touch
+from evaluation.papers.tables.closures import closures_table, fit_weights
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
-from evaluation.papers.trial_sessions import ClosureClaims, closure_claims, run_recording
+from evaluation.papers.trial_sessions import ClosureClaims
 from evaluation.studies.metrics import TouchMetrics
 from ratslam.cli import main
-from ratslam.runs.settings.run_config import load_config
-from tactile.base.errors import InputError
-from tactile.base.se2 import between, integrate
+from ratslam.mapping.closure_judge import KINDS, WEIGHTS, SequenceEvidence, shipped_weights
 
 ROOT = Path(__file__).parents[4]
 
@@ -42,35 +42,26 @@ def stub_sessions(monkeypatch, module, result):
     return tasks
 
 
-def test_rows_are_markdown():
+def test_rows_are_markdown_and_unknown_ones_are_refused_with_a_list(capsys):
     assert markdown_row(["a", 1]) == "| a | 1 |"
     assert markdown_header(["a", "b"]) == "| a | b |\n|---|---|"
-
-
-def test_unknown_rows_are_refused_with_a_list():
     assert select_rows(None, {"a": 1, "b": 2}, ["b"]) == ["b"]
     assert select_rows(["a"], {"a": 1, "b": 2}, ["b"]) == ["a"]
-    with pytest.raises(InputError, match="one of: a; b"):
-        select_rows(["c"], {"a": 1, "b": 2}, ["b"])
+    assert main(["reproduce", "tables", "touch", "--rows", "mian"]) == 2
+    assert "main; clean" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("row", touch.ROWS)
-def test_touch_rows_are_valid_configurations(row):
-    assert touch.task_config(touch.TouchTask(row, 31103)).simulation.seed == 3
+CONFIGS = [(lambda row: touch.task_config(touch.TouchTask(row, 31103)), row) for row in touch.ROWS]
+CONFIGS += [(lambda row: grid.task_config("A", row, 3), row) for row in grid.ROWS]
+CONFIGS += [(lambda row: health.task_config(row, 3)[0], row) for row in health.TOUCH]
 
 
-def test_new_ground_enters_no_cell_twice_and_differs_by_maze():
-    tasks = (touch.TouchTask("new ground", maze) for maze in (31103, 31104))
-    one, other = (touch.task_config(task).simulation for task in tasks)
-    cells = one.path.cells
-    assert len(set(cells)) == len(cells) > 50
-    assert cells != other.path.cells
-    assert one.maze.seed == 31103
-
-
-@pytest.mark.parametrize("row", grid.ROWS)
-def test_grid_rows_are_valid_configurations(row):
-    assert grid.task_config("A", row, 9003).create_simulation.seed == 9003
+@pytest.mark.parametrize(("config_of", "row"), CONFIGS)
+def test_rows_are_valid_configurations(config_of, row):
+    config = config_of(row)
+    simulation = config.simulation or config.create_simulation
+    assert simulation.seed == 3
+    assert config.simulation is None or simulation.maze.seed == 31103 or row in health.TOUCH
 
 
 def test_a_touch_row_gives_medians_worst_values_and_sums(monkeypatch):
@@ -82,20 +73,8 @@ def test_a_touch_row_gives_medians_worst_values_and_sums(monkeypatch):
         "| clean: 2 mm / 0.5 deg | 0.010 (5.00) | 0.040 | 2.00 | 1 of 4 [5-70 %] | 1 of 4 [5-70 %] (2.50) "
         "| 0.020 | 0.500 | 0.900 (0.10), 0.950 | 0.80 | 12 / 400 |"
     )
-
-
-def test_each_touch_row_has_its_number_of_sessions(monkeypatch):
-    tasks = stub_sessions(monkeypatch, touch, lambda task: SESSION)
-    lines = list(touch.touch_table(["main", "tree", "clean"]))
-    assert [sum(task.row == row for task in tasks) for row in ("main", "tree", "clean")] == [40, 20, 12]
-    assert {task.maze for task in tasks if task.row == "tree"} == set(range(31100, 31120))
-    assert "0 of 40 [0-9 %]" in lines[1]
-
-
-def test_touch_sessions_without_closures_have_no_arcr(monkeypatch):
     missing = METRICS._replace(arcr=np.nan, arcr_chain_free=0.0, closures=0, false_closures=0)
-    none = SESSION._replace(metrics=missing)
-    stub_sessions(monkeypatch, touch, lambda task: none)
+    stub_sessions(monkeypatch, touch, lambda task: SESSION._replace(metrics=missing))
     _, row = touch.touch_table(["control: shuffled"], sessions=1)
     assert row.endswith("| 0.500 | - | 0.80 | 0 / 0 |")
 
@@ -116,12 +95,15 @@ def test_a_grid_row_compares_with_dead_reckoning(monkeypatch):
     assert "| 0.200 m | 0.020 | 0.10 | 2, 2 of 2 | 10.5 degrees, 50%, 50% |" in row
 
 
-def test_all_rows_of_the_laser_table_without_data_are_named(monkeypatch, tmp_path):
+@pytest.mark.parametrize("table", [buildings.laser_table, buildings.buildings_table])
+def test_all_rows_without_data_are_named(monkeypatch, tmp_path, table):
     monkeypatch.delenv(recordings.DATA, raising=False)
     stub_sessions(monkeypatch, buildings, lambda task: pytest.fail("a session without a recording"))
     monkeypatch.chdir(tmp_path)
-    text = "\n".join(buildings.laser_table())
-    assert all(f"Left out: {row}: " in text for row in buildings.ROWS)
+    laser = table is buildings.laser_table
+    rows = buildings.ROWS if laser else buildings.buildings_rows()
+    text = "\n".join(table() if laser else table(rows))
+    assert all(f"Left out: {row}: " in text for row in rows)
     assert "set RATSLAM_DATA" in text
 
 
@@ -184,121 +166,71 @@ def test_the_create_is_mapped_at_nine_settings_without_copies(monkeypatch):
     assert lines[-1] == "Create, 9 settings: final median 0.500 m; above odometry: final 0, live 9."
 
 
-@pytest.mark.soak
-def test_a_recording_in_the_folder_of_buildings_is_a_row(tmp_path, monkeypatch):
-    """Four rounds on a circle in a room, by a laser of 180 beams."""
-    write_building(tmp_path / "buildings", "room")
-    monkeypatch.setenv(recordings.DATA, str(tmp_path))
-    rows = buildings.buildings_rows()
-    assert list(rows)[:6] == ["room", "intel", "tuc", "ids lost", "ids wrong", "ids new"]
-    assert buildings.choose_rows(None) == rows
-    present = buildings.choose_rows(["tuc", "room"])
-    assert list(present) == ["room", "tuc"]
-    _, room, _, total, missing = buildings.buildings_table(present, copies=1, workers=1)
-    cells = room.split(" | ")
-    assert cells[0] == "| room"
-    assert cells[7].endswith("of 2")
-    assert int(cells[9].split(" / ")[1]) > 0
-    assert "All buildings, 2 runs" in total
-    assert missing.startswith("Left out: tuc: ")
-    assert missing.endswith("tuc_lecture_hall_odom.csv does not exist")
+FIT, CONTRADICT = 3, 0
 
 
-def test_all_rows_of_the_buildings_table_without_data_are_named(monkeypatch):
-    monkeypatch.delenv(recordings.DATA, raising=False)
-    stub_sessions(monkeypatch, buildings, lambda task: pytest.fail("a session without a recording"))
-    rows = buildings.buildings_rows()
-    text = "\n".join(buildings.buildings_table(rows))
-    assert all(f"Left out: {row}: set RATSLAM_DATA" in text for row in rows)
-    assert "buildings" in rows
+def session(seed, count=60):
+    """Sequences that are true where many views fit, but for some chance; contradictions go with true ones."""
+    random = np.random.default_rng(seed)
+    true = random.random(count) < 0.4
+    counts = random.poisson(3.0, (count, 2, 2, KINDS)).astype(float)
+    counts[..., FIT] += 6 * true[:, None, None]
+    counts[..., CONTRADICT] += 2 * true[:, None, None]
+    evidence = SequenceEvidence(random.normal(2.0 * true - 1, 2.0), counts)
+    return true, random.random(count), random.random(count) < 0.5, (evidence,) * 3
 
 
-@pytest.mark.soak
-@pytest.mark.parametrize("turned_deg", [20, -20])
-def test_a_candidate_claims_the_heading_that_its_shifted_view_shows(turned_deg, tmp_path):
-    """Later rounds are driven with the head turned by two sectors of ten degrees."""
-    write_building(tmp_path / "buildings", "room", np.radians(turned_deg))
-    file = tmp_path / "buildings" / "room_odom_gt.csv"
-    settings = [f"recording.file={file}", "recall.sector_fov=3.14159"]
-    _, session, run = run_recording(load_config(ROOT / "configs" / "building.yaml", settings))
-    claims = closure_claims(session.map, run.truth)
-    assert claims.distance.max() < 0.5
-    assert claims.turn.max() < np.radians(1)
-    blind = closure_claims(session.map, run.truth * [1, 1, 0])  # the claims themselves
-    assert np.isclose(blind.turn, np.radians(20), atol=1e-3).sum() > 20
+def test_the_regression_finds_the_views_that_tell_and_counts_no_contradiction_for_a_place():
+    weights = fit_weights([session(seed) for seed in range(5)])
+    within = weights[:, 3 : 3 + KINDS]
+    assert np.all(within[:, FIT] > 0.1)
+    assert np.all(within.argmax(axis=1) == FIT)
+    assert np.all(weights[:, [3, 4, 3 + KINDS, 4 + KINDS]] <= 0)
 
 
-def write_building(folder, name, turned=0.0):
-    """A recording as those of the buildings: odometry with a heading bias, truth, and scans of a room; from
-    half-time on, the heading is `turned` from the direction of driving, rad."""
-    folder.mkdir()
-    time = np.arange(200.0)
-    angle = 2 * np.pi * time / 50
-    heading = angle + np.pi / 2 + turned * (time >= 100)
-    truth = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), heading])
-    step = between(truth[:-1], truth[1:])
-    odometry = np.vstack([np.zeros(3), integrate(step + [0, 0, 0.002])])
-    beam = truth[:, 2:] + np.radians(np.arange(-89.5, 90))
-    reach = [
-        np.where(np.cos(beam) > 0, 5 - truth[:, :1], -4 - truth[:, :1]) / np.cos(beam),
-        np.where(np.sin(beam) > 0, 4 - truth[:, 1:2], -6 - truth[:, 1:2]) / np.sin(beam),
-    ]
-    header = "t,odo_x,odo_y,odo_th,gt_x,gt_y,gt_th"
-    rows = np.column_stack([time, odometry, truth])
-    np.savetxt(folder / f"{name}_odom_gt.csv", rows, delimiter=",", header=header, comments="")
-    header = ",".join(["t", *(f"r{k}" for k in range(180))])
-    rows = np.column_stack([time, np.min(reach, axis=0)])
-    np.savetxt(folder / f"{name}_scans.csv", rows, delimiter=",", header=header, comments="")
+def test_every_session_is_tested_by_the_weights_of_the_others(monkeypatch, tmp_path):
+    monkeypatch.setattr(
+        closures, "run_tasks", lambda function, tasks, workers: (session(k) for k in range(len(tasks)))
+    )
+    _, *lines, fitted = closures_table(sessions=2, folder=tmp_path)
+    assert [line.split(" | ")[0] for line in lines] == [f"| {row}" for row in (*closures.ROWS, "all")]
+    assert set(closures.ROWS) <= set(touch.ROWS)
+    assert float(lines[-1].split(" | ")[6]) > 0.9
+    held = json.loads((tmp_path / WEIGHTS).read_text(encoding="utf-8"))
+    assert held == json.loads(fitted.strip().removeprefix("```json").removesuffix("```"))
+    assert np.shape(held["weights"]) == shipped_weights().shape
 
 
-def test_the_command_refuses_unknown_rows(capsys):
-    assert main(["reproduce", "tables", "touch", "--rows", "mian"]) == 2
-    assert "main; clean" in capsys.readouterr().err
+def test_nothing_said_is_not_counted():
+    one = session(0)
+    one[3][0].odometry_ratio[:10] = np.nan
+    odds = one[3][0].log_odds(fit_weights([one, session(1)]))
+    assert np.isnan(odds[:10]).all()
+    assert np.isfinite(odds[10:]).all()
 
 
-def test_the_batch_table_times_networks_sets_and_sessions(monkeypatch):
-    for name, value in {"BATCH_SIZES": (11,), "SINGLE": 4, "FEW": 4, "RECORDED": 2}.items():
-        monkeypatch.setattr(batches, name, value)
-    lines = list(batches.batch_table(sets=10, sessions=3, steps=40, rounds=1))
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[1:]]
-    assert [what.split(",")[0] for what, _, _ in rows] == [
-        "one network of 11 cells a side", "one network of 11 cells a side", "2 sets of 21 cells",
-        "2 sets of 21 cells", "2 sets of 21 cells", "2 sessions of 40 steps", "2 sessions of 40 steps",
-    ]  # fmt: skip
-    assert all(device == "one core" and float(us) > 0 for _, device, us in rows)
-    assert float(rows[5][0].rsplit(" ", 1)[1]) < 1e-9
+def judged(seed, count=80):
+    """Maps that are bad where their first feature is low, but for some chance."""
+    random = np.random.default_rng(seed)
+    features = random.normal(size=(count, 5))
+    bad = features[:, 0] + 0.3 * random.normal(size=count) < -0.5
+    return np.column_stack([features, np.where(bad, 2.0, 0.5), bad, random.integers(1, 50, count)])
 
 
-def test_the_cycle_table_times_replayed_and_live_steps(monkeypatch):
-    monkeypatch.setattr(cycles, "BACKENDS", ("classic",))
-    _, *lines = cycles.cycle_table(["square"], rounds=1)
-    for line, dtype in zip(lines, ("float64", "float32"), strict=True):
-        name, backend, precision, steps, *times = [cell.strip() for cell in line.split("|")[1:-1]]
-        assert (name, backend, precision, steps) == ("square", "classic", dtype, "349")
-        mean, median, percentile, slowest, clock = map(float, times)
-        assert 0 < median <= percentile <= 1e3 * slowest + 50
-        assert slowest <= clock + 0.1
-        assert mean > 0
+def test_the_regression_of_health_finds_the_feature_that_tells_in_any_unit():
+    weights = health.fit_weights(judged(0, 400))
+    assert weights[1] < -2
+    assert np.all(np.abs(weights[2:]) < 0.3 * abs(weights[1]))
+    maps, units = judged(0), np.array([1.0, 10.0, 0.1, 3.0, 1.0])
+    scaled = health.fit_weights(maps * [*units, 1, 1, 1])
+    assert scaled[1:] * units == pytest.approx(health.fit_weights(maps)[1:], rel=1e-3, abs=1e-4)
 
 
-def test_the_parts_of_a_cycle_add_up_to_its_time():
-    header, *lines = cycles.profile_table(["square"])
-    assert "square, recall" in header
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
-    assert [name for name, *_ in rows] == [*cycles.PARTS, "all"]
-    parts = {name: float(recall) for name, recall, _ in rows}
-    whole = parts.pop("all")
-    assert sum(parts.values()) == pytest.approx(whole, abs=len(parts))
-    assert all(parts[name] > 0 for name in ("views and belief (compiled kernel)", "closures", "solver"))
-    assert parts["judge"] == 0  # of whiskers only
-
-
-def test_the_time_of_library_functions_counts_for_those_that_call_them():
-    own, wrapper, builtin = ("/a/ratslam/x.py", 1, "f"), ("/lib/w.py", 1, "w"), ("~", 0, "b")
-    root = ("/lib/main.py", 1, "main")
-    stats = {
-        own: (1, 1, 2.0, 7.0, {root: (1, 1, 2.0, 7.0)}),
-        wrapper: (1, 1, 1.0, 4.0, {own: (1, 1, 1.0, 4.0)}),
-        builtin: (2, 2, 4.0, 4.0, {wrapper: (1, 1, 3.0, 3.0), own: (1, 1, 1.0, 1.0)}),
-    }
-    assert cycles.own_times(stats)[own] == pytest.approx(7.0)
+def test_every_second_session_tests_the_regression_of_health(monkeypatch):
+    monkeypatch.setattr(health, "real_recordings", lambda: None)
+    monkeypatch.setattr(health, "run_tasks", lambda function, tasks, workers: map(judged, range(len(tasks))))
+    _, *lines, fitted = health.health_table(sessions=2)
+    rows = (*health.TOUCH, "all", "even, fitted on these", "odd, fitted on even ones")
+    assert [line.split(" | ")[0] for line in lines] == [f"| {row}" for row in rows]
+    assert float(lines[-1].split(" | ")[3]) > 0.9
+    assert len(fitted.split(": ")[1].split(", ")) == 6

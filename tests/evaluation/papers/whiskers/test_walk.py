@@ -7,21 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.papers.whiskers.walk import (
-    continue_path,
-    draw_energies,
-    last_before_reversal,
-)
-from evaluation.papers.whiskers.walk_source import (
-    AWAY,
-    ENTRY,
-    WalkConfig,
-    draw_by_place,
-    most_needed,
-    open_walk,
-    plan_visits,
-    walk_simulation,
-)
+from evaluation.papers.whiskers import walk_source
+from evaluation.papers.whiskers.walk import continue_path, draw_energies, last_before_reversal
 from robot.simulation.head.odometry_errors import OdometryConfig
 from robot.world.maze import CELL_SIDE
 from tactile.base.errors import InputError
@@ -45,7 +32,7 @@ def records_of(rows=20, things=3):
 def test_a_place_is_a_cell_and_a_facing():
     there = along(np.arange(40))
     back = along(np.arange(40), heading=np.pi)
-    thing, later = plan_visits(np.concatenate([there, back, there]), 10, seed=1)
+    thing, later = walk_source.plan_visits(np.concatenate([there, back, there]), 10, seed=1)
     first, turned, again = thing.reshape(3, 40, 6)
     np.testing.assert_array_equal(first, again)
     assert (first == first[:, :1]).all()
@@ -56,27 +43,35 @@ def test_a_place_is_a_cell_and_a_facing():
     assert later[2].all()
 
 
-def test_a_visit_ends_after_long_enough_elsewhere():
-    short = np.concatenate([along([0]), along([1], whisks=AWAY - 1), along([0])])
-    long = np.concatenate([along([0]), along([1], whisks=AWAY), along([0])])
-    assert not plan_visits(short, 10, 0)[1].any()
-    assert plan_visits(long, 10, 0)[1].sum() == 6
-
-
 def test_rows_come_from_the_half_of_the_visit_and_never_twice():
     random = np.random.default_rng(2)
     thing, later = random.integers(3, size=24), random.random(24) < 0.5
-    number = draw_by_place(records_of(), (thing, later), seed=3)[:, 0, 0]
+    number = walk_source.draw_by_place(records_of(), (thing, later), seed=3)[:, 0, 0]
     assert len(set(number)) == 24
     np.testing.assert_array_equal(number // 20, thing)
     np.testing.assert_array_equal(number % 20 >= 10, later)
 
 
-def test_object_that_is_needed_too_often():
+def test_a_visit_ends_after_long_enough_elsewhere():
+    short, long = (
+        np.concatenate([along([0]), along([1], whisks=away), along([0])])
+        for away in (walk_source.AWAY - 1, walk_source.AWAY)
+    )
+    assert not walk_source.plan_visits(short, 10, 0)[1].any()
+    assert walk_source.plan_visits(long, 10, 0)[1].sum() == 6
+
+
+def test_too_few_recordings_are_refused(tmp_path):
     visits = np.zeros(11, int), np.zeros(11, bool)
-    assert most_needed(visits) == 11
-    with pytest.raises(InputError, match="object 0 is felt 11 times in first visits"):
-        draw_by_place(records_of(), visits, seed=0)
+    assert walk_source.most_needed(visits) == 11
+    with pytest.raises(InputError, match="object 0 is felt 11 times"):
+        walk_source.draw_by_place(records_of(), visits, seed=0)
+    for folder, named in ((tmp_path, "no CSV files"), (SLICE, "choose another seed")):
+        with pytest.raises(InputError, match=named):
+            walk_source.open_walk(
+                walk_source.WalkConfig(folder=folder, simulation=walk_source.walk_simulation(31200))
+            )
+    assert walk_source.ENTRY.config_class is walk_source.WalkConfig
 
 
 def test_reckoned_path_is_true_up_to_its_start():
@@ -122,28 +117,3 @@ def test_drawn_energies_are_those_of_the_noise_and_of_the_path():
     assert len(np.unique(drawn[0])) == 5
     assert (drawn[2] != drawn[0]).all()
     np.testing.assert_array_equal(drawn[0], energies_of((truth,), "gated")[0])
-
-
-def test_folder_without_recordings(tmp_path):
-    with pytest.raises(InputError, match="no CSV files"):
-        open_walk(WalkConfig(folder=tmp_path, simulation=walk_simulation(31200)))
-
-
-def test_slice_is_too_short_for_a_walk():
-    with pytest.raises(InputError, match="choose another seed"):
-        open_walk(WalkConfig(folder=SLICE, simulation=walk_simulation(31200)))
-    assert ENTRY.config_class is WalkConfig
-
-
-def test_walk_over_the_whole_recording(reference_data):
-    folder = reference_data / "real_touch" / "actuated_whisker_purdue" / "data" / "objCls"
-    if not folder.is_dir():
-        pytest.skip(f"no folder {folder}")
-    config = WalkConfig(folder=folder, simulation=walk_simulation(31201), seed=31201)
-    walk, shuffled = open_walk(config), open_walk(config.model_copy(update={"shuffled": True}))
-    assert walk.view_shape == (1, 8, 16)
-    assert walk.info.signed_views
-    assert 500 < walk.length < 800
-    np.testing.assert_array_equal(walk.truth, shuffled.truth)
-    assert walk.digest != shuffled.digest
-    assert not np.array_equal(walk.views, shuffled.views)
