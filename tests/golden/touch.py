@@ -29,13 +29,8 @@ ROWS = 1024
 def decisions(name: str) -> dict[str, Any]:
     """The decisions on a session: experiences as [id, steps] in order, counts of actions, closures as
     [later, earlier] steps, counts of the Experience Metric."""
-    config = RunConfig.model_validate(
-        {
-            "recording": {"file": FOLDER / f"{name}.mcap"},
-            "session": {"reserve": ROWS},
-            "keyframes": SESSIONS[name],
-        }
-    )
+    settings = {"recording": {"file": FOLDER / f"{name}.mcap"}, "session": {"reserve": ROWS}}
+    config = RunConfig.model_validate(settings | {"keyframes": SESSIONS[name]})
     with open_observations(config) as (config, source):
         session = build_session(config, source)
         rows: list[tuple[Any, Observation]] = list(read_observations(source))

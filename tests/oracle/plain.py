@@ -6,15 +6,29 @@ It shares only the attractor, the sums of differences and the box around the pea
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
-from tests.oracle.cells import Attractor, Cell, Pose, box_around
-from tests.oracle.places import CREATE, EDGE, NONE, SET, Experience, Memory
+from tests.oracle.stock import (
+    CREATE,
+    EDGE,
+    NONE,
+    SET,
+    Attractor,
+    Cell,
+    Experience,
+    Match,
+    Memory,
+    Pose,
+    box_around,
+    compared_pixels,
+    offsets,
+    summed_differences,
+    wrapped,
+)
 from tests.oracle.trace import Array, Parameters
-from tests.oracle.views import Match, compared_pixels, offsets, summed_differences, wrapped
 
 VIEW_TIE = PLACE_TIE = PEAK_TIE = 1e-9
 WORN_OUT = 3.0  # habituation above this injects no energy
@@ -22,33 +36,12 @@ LONGEST_PART, MOST_PARTS = 0.75, 256
 LOST = 1.0  # a difference above one cell is a jump, not a lag
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Parameters that the stock engine does not have."""
-
-    recent: int
-    settle_steps: int
-    column_angle: float
-
-
-@dataclass(frozen=True)
-class Input:
-    """One observation: the motion in the body frame (m, m, rad) and a view or a label, if there was one."""
-
-    motion: Pose
-    view: Array | None
-    label: int | None
-
-
-@dataclass(frozen=True)
-class PlainStep:
-    """Decisions of the plain engine in one step."""
-
-    template: int
-    energy: float
-    packet: Pose
-    action: int
-    place: int
+Settings = namedtuple("Settings", "recent settle_steps column_angle")
+"""Parameters that the stock engine does not have."""
+Input = namedtuple("Input", "motion view label")
+"""One observation: the motion in the body frame (m, m, rad) and a view or a label, if there was one."""
+PlainStep = namedtuple("PlainStep", "template energy packet action place")
+"""Decisions of the plain engine in one step."""
 
 
 def around(d: float, n: float) -> float:
@@ -234,8 +227,9 @@ class PlainCells:
 class PlainPlaces:
     """Step 4: places and the links between them."""
 
-    def __init__(self, parameters: Parameters) -> None:
-        self.radius = parameters.exp_delta_pc_threshold
+    def __init__(self, parameters: Parameters, heading_radius: float | None = None) -> None:
+        radius = parameters.exp_delta_pc_threshold
+        self.radii = (radius, radius, heading_radius or radius)
         self.rings = (parameters.pc_dim_xy, parameters.pc_dim_xy, parameters.pc_dim_th)
         self.places: list[Experience] = []
         self.joined: set[frozenset[int]] = set()
@@ -244,9 +238,8 @@ class PlainPlaces:
     def far(self, place: int, packet: Pose) -> float:
         """The distance in radii."""
         there = self.places[place].packet
-        return math.hypot(
-            *(around(a - b, n) / self.radius for a, b, n in zip(packet, there, self.rings, strict=True))
-        )
+        rings = zip(packet, there, self.rings, self.radii, strict=True)
+        return math.hypot(*(around(a - b, n) / radius for a, b, n, radius in rings))
 
     def act(self, packet: Pose, template: int) -> int:
         """Keep, reach or create a place."""

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import json
-import zipfile
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
 VIEW, ODOMETRY = 1, 2
-
-
-class TraceError(Exception):
-    """A file that is missing, unreadable or not a trace."""
+ROOT = Path(__file__).parents[2]
+GOLDEN = ROOT / "tests" / "golden"
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ class Row:
 class Trace:
     """One file. `arrays` holds everything in it under its own name."""
 
-    name: str
+    path: Path
     parameters: Parameters
     strings: dict[str, str]
     labelled: bool
@@ -97,23 +95,31 @@ class Trace:
             yield Row(float(stamp), float(v), float(w), bool(int(flags) & ODOMETRY), view, label)
 
 
-def load(path: Path | str) -> Trace:
-    """Opens a trace; a `TraceError` gives in one line the reason that it cannot be read."""
-    path = Path(path)
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        strings = json.loads(str(arrays["params_json"][()]))
-        parameters = Parameters.from_strings(strings)
-        missing = [n for n in ("in_t", "in_v", "in_w", "in_flags", "in_view") if n not in arrays]
-        if missing:
-            raise TraceError(f"{path}: no {', '.join(missing)} in the file")
-    except KeyError as error:
-        raise TraceError(f"{path}: no {error.args[0]} in the file") from error
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
-        raise TraceError(f"{path}: {' '.join(str(error).split())}") from error
-    size = parameters.template_x_size * parameters.template_y_size
-    width = arrays["in_view"].shape[1] if arrays["in_view"].ndim == 2 else 0
-    if width not in (2, size):
-        raise TraceError(f"{path}: in_view has {width} columns, not {size} pixels or 2 (id, relative_rad)")
-    return Trace(path.stem, parameters, strings, width == 2 and size != 2, arrays)
+def load(path: Path) -> Trace:
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    strings = json.loads(str(arrays["params_json"][()]))
+    parameters = Parameters.from_strings(strings)
+    labelled = arrays["in_view"].shape[1] == 2 != parameters.template_x_size * parameters.template_y_size
+    return Trace(path, parameters, strings, labelled, arrays)
+
+
+def golden(name: str) -> Trace:
+    return load(GOLDEN / f"{name}.npz")
+
+
+def real(name: str) -> Trace:
+    """A real trace, which is not part of the project."""
+    data = Path(os.environ.get("RATSLAM_DATA") or ROOT.parent / "shared" / "reference")
+    path = data / "traces" / f"{name}.npz"
+    if not path.is_file():
+        pytest.skip(f"no {path}: set RATSLAM_DATA to the folder that holds traces/")
+    return load(path)
+
+
+def changed(folder: Path, **changes: object) -> Trace:
+    """The smallest golden trace with some of its arrays replaced."""
+    arrays = dict(golden("j_reverse_stop").arrays) | changes
+    path = folder / "changed.npz"
+    np.savez(path, **arrays)
+    return load(path)

@@ -1,15 +1,21 @@
-"""Laws of the grid filter's map: what it keeps, draws and writes."""
+"""Laws of the grid filter's map: what it keeps, draws and writes; eq. 3 and 4 in the drawn map."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.special import expit, logit
 
 from ratslam.core.estimates import Estimate
 from ratslam.grid import particles
+from ratslam.grid.config import DrawingConfig, GridConfig
+from ratslam.grid.map import ContactLog, draw_occupancy
 from ratslam.methods.grid import GridEvidence
+from tactile.base.se2 import compose
 from tactile.base.types import MotionKind
-from tests.helpers.grid_world import TIPS, filter_of, report, settings
+from tests.helpers.grid_world import TIPS, create, filter_of, report, settings
 
 COUNT = 5
 BACKEND = filter_of(settings(particles=COUNT), side=2.55)
@@ -30,12 +36,9 @@ def random_steps(count, seed=0):
         estimate = Estimate(weights @ poses, np.zeros(3), -1, -1, 0, False)
         touching = np.flatnonzero(stream.random(4) < 0.4)
         wall = (0.3, 0.2) if len(touching) > 1 else None
-        forward = stream.choice([0.05, -0.05])
-        yield (
-            report(forward, touching=touching, wall=wall, dead=[3] if k % 7 == 0 else []),
-            estimate,
-            GridEvidence(ancestor, poses, weights, 1 / (weights**2).sum(), 0),
-        )
+        dead = [3] if k % 7 == 0 else []
+        seen = report(stream.choice([0.05, -0.05]), touching=touching, wall=wall, dead=dead)
+        yield seen, estimate, GridEvidence(ancestor, poses, weights, 1 / (weights**2).sum(), 0)
 
 
 def map_of_steps(steps):
@@ -59,17 +62,6 @@ def test_an_empty_map_is_the_prior():
     assert grid.feedback() is None
 
 
-def test_obstacles_lie_at_the_contacts():
-    for pose in ([0.0, 0.0, 0.0], [0.3, -0.4, 0.0], [0.3, -0.4, 2.0]):
-        probability = map_of(report(0.05, touching=[1, 2]), pose=pose).occupancy()
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        for tip in TIPS[1:3]:
-            x, y = pose[0] + c * tip[0] - s * tip[1], pose[1] + s * tip[0] + c * tip[1]
-            assert probability[round(y / 0.05) + 25, round(x / 0.05) + 25] > 0.4
-        assert probability[round(pose[1] / 0.05) + 25, round(pose[0] / 0.05) + 25] < BACKEND.config.prior
-        assert probability.max() > 0.5
-
-
 def test_reports_without_evidence_are_not_drawn():
     plain = map_of(report(0.05)).occupancy()
     for silent in (
@@ -77,24 +69,23 @@ def test_reports_without_evidence_are_not_drawn():
         report(0.05, touching=[0, 1, 2, 3], dead=[0, 1, 2, 3], motion=MotionKind.BACK),
     ):
         assert np.array_equal(map_of(report(0.05), silent).occupancy(), plain)
-    dead = [map_of(report(0.05, touching=touching, dead=[0])).occupancy() for touching in ([], [0])]
-    assert np.array_equal(*dead)
-    turning, numb = (
-        map_of(o).occupancy() for o in (report(turn=0.1, touching=[0]), report(turn=0.1, dead=[0]))
-    )
-    assert np.array_equal(turning, numb)
+    for one, same in (
+        (report(0.05, touching=[0], dead=[0]), report(0.05, dead=[0])),
+        (report(turn=0.1, touching=[0]), report(turn=0.1, dead=[0])),
+    ):
+        assert np.array_equal(map_of(one).occupancy(), map_of(same).occupancy())
 
 
 def test_values_that_are_not_finite_are_not_drawn():
     """The map ignores the values that the filter ignores."""
     plain = report(0.05, touching=[0, 1], wall=(0.3, 0.1))
-    expected = map_of(report(0.05, dead=[0, 1])).occupancy()
-    odd = plain._replace(point=np.full((4, 2), np.nan))
-    assert map_of(odd).occupancy() == pytest.approx(expected)
-    unknown = map_of(plain._replace(wall_point=np.full(2, np.nan))).occupancy()
-    assert unknown == pytest.approx(map_of(report(0.05, touching=[0, 1])).occupancy())
-    at_foot = map_of(plain._replace(wall_point=np.zeros(2))).occupancy()
-    assert at_foot == pytest.approx(map_of(report(0.05, touching=[0, 1])).occupancy())
+    without = report(0.05, touching=[0, 1])
+    for odd, same in (
+        (plain._replace(point=np.full((4, 2), np.nan)), report(0.05, dead=[0, 1])),
+        (plain._replace(wall_point=np.full(2, np.nan)), without),
+        (plain._replace(wall_point=np.zeros(2)), without),
+    ):
+        assert map_of(odd).occupancy() == pytest.approx(map_of(same).occupancy())
 
 
 def test_the_map_is_drawn_along_the_surviving_paths():
@@ -113,6 +104,7 @@ def test_the_map_is_drawn_along_the_surviving_paths():
 
 def test_files_hold_the_map_and_its_origin(tmp_path):
     grid = map_of(report(0.05, touching=[1, 2]))
+    assert grid.occupancy().max() > 0.5
     for name, write in grid.files().items():
         write(tmp_path / name)
     with np.load(tmp_path / "grid.npz") as stored:
@@ -136,9 +128,8 @@ def test_a_restored_map_continues_bit_for_bit(monkeypatch, levels, stop):
     for step in steps[stop:]:
         second.update(*step)
     assert second.arrays().keys() == whole.arrays().keys()
-    assert all(
-        np.array_equal(value, second.arrays()[name], equal_nan=True) for name, value in whole.arrays().items()
-    )
+    for name, value in whole.arrays().items():
+        np.testing.assert_array_equal(value, second.arrays()[name], err_msg=name)
     assert np.array_equal(second.trajectory(), whole.trajectory())
     assert np.array_equal(second.occupancy(), whole.occupancy())
     assert whole.trajectory().shape == (50, 3)
@@ -152,3 +143,155 @@ def test_reading_the_map_does_not_change_it():
         second.trajectory(), second.occupancy(), second.online_trajectory(), second.arrays()
     assert np.array_equal(first.occupancy(), second.occupancy())
     assert np.array_equal(first.trajectory(), second.trajectory())
+
+
+# The drawn map
+
+SIDE, MIDDLE = 51, 25
+PAPER = DrawingConfig(contact=0.8, blob_sd=0.05, edge_sd=0.25, edge_sector=np.pi / 12)
+CONFIG = GridConfig(body=0.0, drawing=PAPER)
+PRIOR = CONFIG.prior
+
+
+def marks(count, **some):
+    """A log of reports of dead whiskers, with the given fields replaced."""
+    plain = ContactLog(
+        valid=np.ones(count, bool), contact=np.zeros((count, 4), bool), free=np.zeros((count, 4), bool),
+        turning=np.zeros(count, bool), point=np.zeros((count, 4, 2)), wall=np.full((count, 2), np.nan),
+    )  # fmt: skip
+    return plain._replace(**some)
+
+
+def touching(count, whisker, point):
+    contact, points = np.zeros((count, 4), bool), np.zeros((count, 4, 2))
+    contact[:, whisker], points[:, whisker] = True, point
+    return {"contact": contact, "point": points}
+
+
+def drawn(log, path=None, config=CONFIG, side=SIDE):
+    path = np.zeros((len(log.valid), 3)) if path is None else np.asarray(path, float)
+    return draw_occupancy(config, create(), side, path, log)
+
+
+def test_a_blob_fades_into_the_prior():
+    """A chance of 0.8 on a prior of 0.3, of a standard deviation of one cell: 0.632, 0.479, 0.335 at 0, 1
+    and 2 cells, and 0.300 far away, where eq. 3 as printed would erase the map."""
+    grid = drawn(marks(1, **touching(1, 0, [0.25, 0.1])))
+    row, column = MIDDLE + 2, MIDDLE + 5
+    assert grid[row, column : column + 3] == pytest.approx([0.632, 0.479, 0.335], abs=5e-4)
+    assert grid[row : row + 3, column] == pytest.approx([0.632, 0.479, 0.335], abs=5e-4)
+    assert grid[row, column - 2] == pytest.approx(0.335, abs=5e-4)
+    far = np.hypot(*np.mgrid[:SIDE, :SIDE] - np.array([row, column])[:, None, None]) > 4.5
+    assert grid[far] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("pose", [[0.4, -0.3, 0.0], [0.2, 0.2, 2.0], [-0.5, 0.4, -np.pi / 2]])
+def test_contacts_are_drawn_at_the_whisker_tip(pose):
+    grid = drawn(marks(1, **touching(1, 2, TIPS[2])), [pose])
+    place = compose(np.array(pose), np.array([*TIPS[2], 0.0]))[:2] / CONFIG.cell + MIDDLE
+    row, column = np.unravel_index(grid.argmax(), grid.shape)
+    assert np.hypot(column - place[0], row - place[1]) < 0.75  # the nearest cell; rows are y
+
+
+def test_evidence_of_many_reports_adds_up_to_a_limit():
+    def after(count):
+        log = marks(count, **touching(count, 0, [0.25, 0.0]))
+        log.valid[1::2] = False
+        return logit(drawn(log)[MIDDLE, MIDDLE + 5]) - logit(PRIOR)
+
+    assert after(3) == pytest.approx(2 * after(2))
+    assert after(100) == pytest.approx(CONFIG.drawing.max_log_odds)
+
+
+def test_free_whiskers_and_the_body_clear_cells():
+    free = marks(200, free=np.ones((200, 4), bool))
+    grid = drawn(free)
+    middle = np.rint(create().points(np.array([0.5]))[:, 0] / CONFIG.cell + MIDDLE).astype(int)
+    assert (grid[middle[:, 1], middle[:, 0]] < 0.05).all()
+    assert grid.min() == pytest.approx(expit(-CONFIG.drawing.max_log_odds + logit(PRIOR)))
+    assert grid[:, : MIDDLE - 2] == pytest.approx(PRIOR)  # behind the robot the map is unexplored
+    assert grid.max() <= PRIOR + 1e-12
+    body = drawn(marks(1), config=GridConfig())
+    assert np.unravel_index(body.argmin(), body.shape) == (MIDDLE, MIDDLE)
+    assert body[MIDDLE, MIDDLE] == pytest.approx(expit(logit(CONFIG.drawing.body) + logit(PRIOR)))
+
+
+@pytest.mark.parametrize("angle", np.radians([0, 30, 90, 200]))
+def test_a_wall_is_drawn_both_ways_from_the_contact(angle):
+    normal = np.array([np.cos(angle), np.sin(angle)])
+    log = marks(1, wall=0.3 * normal[None], **touching(1, 1, 0.2 * normal))
+    at = (np.arange(SIDE) - MIDDLE) * CONFIG.cell
+    right, up = at[None] - 0.3 * normal[0], at[:, None] - 0.3 * normal[1]
+    off = np.mod(np.arctan2(up, right) - angle, np.pi) - np.pi / 2  # from the wall, in either direction
+    away = right**2 + up**2
+    shape = np.exp(-away / (2 * 0.25**2) - np.where(away > 1e-12, off, 0.0) ** 2 / (2 * (np.pi / 12) ** 2))
+    near = (np.abs(right) <= 0.75 + 1e-9) & (np.abs(up) <= 0.75 + 1e-9)  # three standard deviations
+    expected = expit(logit(0.5 + 0.3 * shape * near) + logit(PRIOR))
+    assert drawn(log) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_wall_replaces_the_blobs_of_its_contacts():
+    """HIT1, then HIT2 with the wall: no blob is left at HIT1; after ABORT there is one."""
+    log = marks(3, **touching(3, 1, TIPS[1]))
+    log.valid[2] = False
+    abort = drawn(log)
+    assert abort.max() > 0.5
+    log.contact[1, 2], log.point[1, 2] = True, TIPS[2]
+    log.wall[1] = [TIPS[1, 0], 0.0]
+    hit = drawn(log)
+    alone = marks(1, wall=log.wall[1:2], contact=log.contact[1:2], point=log.point[1:2])
+    assert hit == pytest.approx(drawn(alone))
+
+
+def test_a_wall_keeps_the_blob_of_an_earlier_contact():
+    """One that ended before, also where the robot never backs off."""
+    log = marks(3, **touching(3, 1, TIPS[1]))
+    log.contact[1] = False
+    log.wall[2] = [0.25, 0.0]
+    path = np.array([[-0.6, 0.0, 0.0], [-0.3, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    place = path[0, :2] + TIPS[1]
+    column, row = np.rint(place / CONFIG.cell + MIDDLE).astype(int)
+    assert drawn(log, path)[row, column] > 0.5
+
+
+def test_continued_contacts_and_contacts_in_turns_leave_no_blob():
+    held = marks(5, **touching(5, 0, [0.25, 0.1]))
+    once = marks(1, **touching(1, 0, [0.25, 0.1]))
+    assert drawn(held) == pytest.approx(drawn(once))
+    turning = marks(5, turning=np.ones(5, bool), **touching(5, 0, [0.25, 0.1]))
+    assert drawn(turning) == pytest.approx(PRIOR)
+
+
+def test_invalid_reports_leave_the_map_unchanged():
+    log = marks(4, free=np.ones((4, 4), bool), wall=np.full((4, 2), 0.2), **touching(4, 0, [0.25, 0.1]))
+    assert drawn(log._replace(valid=np.zeros(4, bool)), config=GridConfig()) == pytest.approx(PRIOR)
+
+
+@pytest.mark.parametrize("side", [1, 4, 50])
+def test_contacts_outside_the_map_are_dropped(side):
+    path = [[3.0, 0.0, 0.0], [-1e3, 1e3, 1.0], [1e9, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    log = marks(4, free=np.ones((4, 4), bool), wall=np.tile([0.3, 0.0], (4, 1)), **touching(4, 0, TIPS[0]))
+    grid = drawn(log, path, side=side)
+    assert grid.shape == (side, side)
+    assert np.isfinite(grid).all()
+    assert drawn(ContactLog(*(rows[:3] for rows in log)), path[:3], side=side) == pytest.approx(PRIOR)
+
+
+@given(
+    seed=st.integers(0, 1000),
+    chances=st.tuples(*[st.floats(1e-6, 1 - 1e-6)] * 3),
+    most=st.floats(0.1, 20.0),
+    side=st.integers(1, 12),
+)
+def test_any_contacts_give_a_map_of_probabilities(seed, chances, most, side):
+    random, count = np.random.default_rng(seed), 12
+    log = ContactLog(
+        random.random(count) < 0.8, random.random((count, 4)) < 0.3, random.random((count, 4)) < 0.6,
+        random.random(count) < 0.2, random.normal(0, 0.2, (count, 4, 2)),
+        np.where(random.random((count, 1)) < 0.5, np.nan, random.normal(0, 0.2, (count, 2))),
+    )  # fmt: skip
+    contact, free, body = chances
+    some = {"contact": contact, "free": free, "body": body, "max_log_odds": most}
+    config = GridConfig(body=0.12, drawing=PAPER.model_copy(update=some))
+    grid = drawn(log, np.cumsum(random.normal(0, 0.1, (count, 3)), axis=0), config=config, side=side)
+    assert ((grid > 0) & (grid < 1)).all()

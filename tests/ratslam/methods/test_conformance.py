@@ -31,12 +31,9 @@ TOUCH = {
 SIGNED = TOUCH | {"recall": {"sector_fov": "whiskers", "images": "signed"}}
 # With large odometry noise, so that it resamples throughout the session.
 DOUBTFUL = {
-    "particles": 20,
-    "side": 1.5,
-    "drift": {"step": 0.3, "heading": 0.05},
-    "likelihood": {"free": 0.5, "contact": 4.0},
-    "resampling": {"min_effective_share": 0.9},
-}
+    "particles": 20, "side": 1.5, "drift": {"step": 0.3, "heading": 0.05},
+    "likelihood": {"free": 0.5, "contact": 4.0}, "resampling": {"min_effective_share": 0.9},
+}  # fmt: skip
 METHODS = {
     "recall": pose_cells("recall", "views"),
     "recall-labels": pose_cells("recall", "labels"),
@@ -54,9 +51,9 @@ OFTEN = {"recall", "recall-labels", "classic", "classic-labels", "signed-touch",
 `make soak`."""
 
 
-def some(names):
-    """The names as parameters, those of `OFTEN` for the soak."""
-    return [pytest.param(name, marks=pytest.mark.soak) if name in OFTEN else name for name in names]
+def some(names, seldom=OFTEN):
+    """The names as parameters, the seldom ones for the soak."""
+    return [pytest.param(name, marks=pytest.mark.soak) if name in seldom else name for name in names]
 
 
 @cache
@@ -101,9 +98,7 @@ def test_our_backends_pass(name, check):
     check.run(trial_of(name))
 
 
-@pytest.mark.parametrize(
-    "name", [one if one == "grid" else pytest.param(one, marks=pytest.mark.soak) for one in METHODS]
-)
+@pytest.mark.parametrize("name", some(METHODS, METHODS.keys() - {"grid"}))
 def test_the_evidence_is_finite_in_single_precision(name):
     _, steps = trial_of(name).single
     for step in steps:
@@ -113,33 +108,25 @@ def test_the_evidence_is_finite_in_single_precision(name):
             assert value.dtype.kind != "f" or np.isfinite(value).all()
 
 
-def test_touch_closes_loops_and_selects_sequences_in_these_walks():
+def outcomes(name):
+    return np.array([step.evidence.outcome for step in trial_of(name).steps])
+
+
+def test_these_walks_close_loops_select_sequences_and_resample():
     # Otherwise the checks of replay, checkpoints and capacities would not cover it.
     arrays = trial_of("touch").arrays
     assert arrays["map/appearance/likeness/0"].any()
     weight = arrays["map/log/weight"]
     assert ((weight > 0) & (weight < 1)).any()
-
-
-def test_the_grid_filter_resamples_in_these_walks():
-    # Otherwise the checks of replay and checkpoints would not cover it.
-    outcomes = np.array([step.evidence.outcome for step in trial_of("grid").steps])
-    assert 10 < (outcomes == GridOutcome.RESAMPLED).sum() < 330
+    assert 10 < (outcomes("grid") == GridOutcome.RESAMPLED).sum() < 330
 
 
 @pytest.mark.soak
-def test_the_pose_is_found_and_searched_for_in_these_walks():
-    # Otherwise the checks of replay and checkpoints would not cover it.
-    states = trial_of("localise").map.states()
-    assert 100 < (states == Localisation.FOUND).sum() < 336
-
-
-@pytest.mark.soak
-def test_searches_fail_and_resample_in_these_walks():
-    # Otherwise the checks of replay and checkpoints would not cover it.
-    outcomes = np.array([step.evidence.outcome for step in trial_of("localise_grid").steps])
-    assert 5 < (outcomes == GridLocaliseOutcome.RESAMPLED).sum() < 330
-    assert (outcomes == GridLocaliseOutcome.BEGUN_ANEW).sum() > 1
+def test_these_walks_find_the_pose_and_search_for_it():
+    assert 100 < (trial_of("localise").map.states() == Localisation.FOUND).sum() < 336
+    found = outcomes("localise_grid")
+    assert 5 < (found == GridLocaliseOutcome.RESAMPLED).sum() < 330
+    assert (found == GridLocaliseOutcome.BEGUN_ANEW).sum() > 1
 
 
 FIXED = ["classic", "classic-labels", "grid", "localise", "localise_grid", EXAMPLE]

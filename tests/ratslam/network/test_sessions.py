@@ -1,19 +1,50 @@
-"""Sessions whose network doubles its sides: the same bits live, in replay and restored, with and without a
-probe, and one compilation for each capacity and sides."""
+"""Sessions on laps whose places look alike: loops are closed by what the pose cells do, and the network grows
+with the same bits live, in replay and restored, with and without a probe."""
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ratslam.core.session import CHUNK, Probe
+from ratslam.core.session import CHUNK, Probe, Session
+from ratslam.methods.config import RecallBackendConfig
+from ratslam.methods.recall import RecallBackend
+from ratslam.network import pose_cells
 from ratslam.network.pose_cells import Belief
-from tests.ratslam.network import alike_places
-from tests.ratslam.network.alike_places import PLACES
+from tactile.base.se2 import between
+from tests.helpers import scenes
+
+PLACES, LOOKS = 40, 8
+STEP = 1.8 * scenes.CELL
+"""Way between two views, m: more than the excitation of a packet reaches."""
+
+
+def laps(count):
+    """Readings of a robot that drives laps, one at each place."""
+    stream = np.random.default_rng(1)
+    path = scenes.followed([(STEP, 2 * np.pi / PLACES)] * (PLACES * count - 1))
+    motion = np.zeros((len(path), 4))
+    motion[1:, :3] = between(path[:-1], path[1:])
+    motion[1:] += stream.normal(0, [0.02 * STEP, 0.0, 0.003, 0.0], (len(path) - 1, 4))
+    motion[:, 3] = 0.5
+    look = stream.permutation(np.arange(PLACES) % LOOKS)[np.arange(len(path)) % PLACES]
+    views = stream.random((LOOKS, 18))[look] + stream.normal(0, 0.012, (len(path), 18))
+    log = scenes.recorded(path, motion, np.clip(views, 0, 1))
+    return [sample.reading for sample in log]
+
+
+def session_of(cells: int = 21, **settings) -> Session:
+    """A session of recall with so many pose cells along x and along y at first; 21 cover the circle."""
+    sections = {"pose_cells": {"cells_xy": cells, "cell_size": scenes.CELL}}
+    config = RecallBackendConfig.model_validate(sections)
+    return Session(RecallBackend(config, (3, 6, 1), np.dtype(float)), **settings)
+
+
+# The network grows
 
 CELLS, LAPS = 11, 7
 PROBED = 160
@@ -24,19 +55,18 @@ STOPS = 24, PROBED, 245
 
 @cache
 def readings():
-    return alike_places.laps(LAPS)
+    return laps(LAPS)
 
 
 @cache
 def compiled():
     """A session without a probe; every test begins it anew, and nothing is compiled twice."""
-    return alike_places.session(CELLS)
+    return session_of(CELLS)
 
 
 def begun():
-    session = compiled()
-    session.restart()
-    return session
+    compiled().restart()
+    return compiled()
 
 
 class Run:
@@ -90,9 +120,12 @@ def test_the_network_doubles_on_the_way_and_loops_are_closed():
 
 @pytest.mark.parametrize("sizes", [[280], [7, 16, 33, 64, 1, 159]], ids=["whole", "parts"])
 def test_live_and_replay_give_the_same_bits(sizes):
+    """And each capacity and sides are compiled once for all of them."""
     run = Run(begun(), sizes)
     assert_same_steps(run.steps, live().steps)
     assert_same(run.arrays, live().arrays)
+    assert run.arrays["sides"].tolist() == [2 * CELLS, 2 * CELLS]
+    assert compiled().compilations() == len(set(live().kinds))
 
 
 @pytest.mark.parametrize("stop", STOPS)
@@ -110,24 +143,16 @@ def test_a_session_that_has_not_begun_is_restored():
     assert_same_steps(session.replay(readings()[:40]), live().steps[:40])
 
 
-def test_each_capacity_and_sides_are_compiled_once():
-    """Live, in parts and again."""
-    kinds = set(live().kinds)
-    run = Run(begun(), [len(readings())])
-    assert compiled().compilations() == len(kinds)
-    assert run.arrays["sides"].tolist() == [2 * CELLS, 2 * CELLS]
-
-
 # The probe
 
 
 @cache
 def probed():
     """A session whose chosen cells are recorded at every step, and all of them at every 20th."""
-    backend = alike_places.session(CELLS).backend
+    backend = session_of(CELLS).backend
     chosen, cells = recorded_cells(), backend.probe()
-    probe = Probe(partial(lambda state: cells.each(state, chosen)), cells.hold, 20)
-    session = alike_places.session(CELLS, probe=probe)
+    probe = Probe(lambda state: cells.each(state, chosen), cells.hold, 20)
+    session = session_of(CELLS, probe=probe)
     return cells, list(session.replay(readings()[:PROBED])), session.arrays()
 
 
@@ -179,3 +204,36 @@ def test_the_probe_names_active_cells_packet_and_certainty():
         assert 0 <= y < CELLS
         assert 0 <= heading < 36
         assert cells.energy(step.evidence) == step.evidence.certainty
+
+
+# Lesions
+
+
+def decisions():
+    """Posteriors [T] and closures [M, 2] of a session of a fixed size that is compiled with the network as it
+    is now."""
+    session = session_of()
+    steps = list(session.replay(readings()[: 6 * PLACES]))
+    return np.array([step.evidence.posterior for step in steps]), session.map.closures()
+
+
+def test_the_intact_network_closes_every_loop():
+    posterior, closures = decisions()
+    assert len(closures) > 4 * PLACES
+    apart = (closures[:, 0] - closures[:, 1]) % PLACES
+    assert np.isin(apart, [0, 1, PLACES - 1]).all()
+    assert (apart == 0).mean() > 0.98
+    assert (posterior > 0.5).sum() > 4 * PLACES
+
+
+@pytest.mark.parametrize(
+    ("part", "lesion"),
+    [
+        ("integrate_path", lambda cells, motion: cells),
+        ("anchor", lambda network, belief, cells, mass: belief),
+    ],
+    ids=["no path integration", "no activity that views drive"],
+)
+def test_no_loop_is_closed_with_a_lesion(monkeypatch, part, lesion):
+    monkeypatch.setattr(pose_cells, part, lesion)
+    assert len(decisions()[1]) == 0

@@ -1,4 +1,4 @@
-"""Laws of records packed as rows of a few arrays."""
+"""Laws of arrays that grow, and of records packed as rows of a few arrays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ratslam.core.arrays import PackedRecords, allocate, layout_of
+from ratslam.core.arrays import GrowableArray, PackedRecords, allocate, layout_of
 
 DTYPES = [np.dtype(name) for name in ("float64", "float32", "int32", "uint32", "bool")]
 
@@ -49,8 +49,7 @@ def test_records_read_back_equal(kind, count):
     for k, each in enumerate(records):
         rows.write(k, each)
     assert len(rows.arrays) == len({dtype for _, dtype in kind})
-    read = list(rows.records(count))
-    for one, other in zip(records, read, strict=True):
+    for one, other in zip(records, rows.records(count), strict=True):
         same(one, other)
 
 
@@ -75,9 +74,31 @@ def test_compiled_code_reads_and_writes_the_same(seed):
         same(one, other)
 
 
-def test_a_record_of_another_shape_is_refused():
+@pytest.mark.parametrize("shapes", [(3, 4), (1, (2, 2))])
+def test_a_record_of_another_shape_is_refused(shapes):
     rows = allocate(layout_of(Inner(np.zeros(3), np.zeros((2, 2)))), 1)
     with pytest.raises(ValueError, match="expected"):
-        rows.write(0, Inner(np.zeros(3), np.zeros(4)))
-    with pytest.raises(ValueError, match="expected"):
-        rows.write(0, Inner(np.zeros(1), np.zeros((2, 2))))
+        rows.write(0, Inner(*map(np.zeros, shapes)))
+
+
+# Arrays that grow
+
+
+@given(st.lists(st.integers(0, 40), max_size=12))
+def test_rows_are_those_appended(counts: list[int]) -> None:
+    array, expected = GrowableArray((2,), np.float64), np.zeros((0, 2))
+    for number, count in enumerate(counts):
+        rows = np.full((count, 2), float(number))
+        expected = np.concatenate([expected, rows])
+        if count == 1:
+            array.append(rows[0])
+        else:
+            array.extend(rows)
+        assert np.array_equal(array.rows, expected)
+
+
+def test_what_is_appended_is_copied() -> None:
+    array, rows = GrowableArray((), np.float64), np.arange(3.0)
+    array.extend(rows)
+    rows[:] = -1
+    assert array.rows.tolist() == [0.0, 1.0, 2.0]

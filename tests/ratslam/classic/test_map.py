@@ -1,0 +1,223 @@
+"""Laws of the classic map: places, the experience map and its relaxation."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap, PlaceConfig, decide
+from ratslam.classic.experience_map import start as empty_store
+from ratslam.classic.relaxation import relax
+from ratslam.core.estimates import Action, Estimate
+from tactile.base.se2 import between, compose, integrate, inverse, wrap
+from tactile.base.types import Odometry, observation
+from tests.oracle.plain import PlainPlaces
+from tests.oracle.stock import Link, StockMap
+from tests.oracle.trace import Parameters
+
+
+class Evidence(NamedTuple):
+    """The fields of `ClassicEvidence` that the map reads."""
+
+    template: int = 0
+    relative: float = 0.0
+
+
+def fold(world: ExperienceMap, moved, action=Action.NONE, place=-1, relative=0.0, dt=1.0):
+    estimate = Estimate(np.zeros(3), np.zeros(3), place, -1, action, False)
+    world.update(observation(Odometry(*moved, dt)), estimate, Evidence(place, relative))
+    return world.pose(estimate)
+
+
+step = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3), st.integers(0, 3), st.integers(0, 5))
+
+
+@given(st.lists(step, min_size=1, max_size=40))
+def test_without_closures_the_map_is_raw_odometry(steps):
+    world = ExperienceMap(ExperienceConfig(closures=False))
+    made, poses = 0, []
+    for *moved, action, place in steps:
+        if action == Action.CREATE:
+            place, made = made, made + 1
+        poses.append(fold(world, moved, Action(action), place, relative=0.3))
+    expected = integrate(np.array([step[:3] for step in steps]))
+    gaps = compose(inverse(expected), np.array(poses))
+    assert np.abs(gaps).max() < 1e-9
+    assert np.abs(compose(inverse(expected), world.trajectory())).max() < 1e-9
+
+
+def square(world: ExperienceMap, sign: float):
+    """Three laps of a unit square; views of later laps are seen rotated by a known angle."""
+    for k in range(12):
+        relative = 0.0 if k < 4 else 0.4 * (k % 3 - 1)
+        before = 0.0 if k <= 4 else 0.4 * ((k - 1) % 3 - 1)
+        # The robot stands turned by `relative` against the heading at which it stored the place.
+        moved = compose(inverse(np.array([0, 0, before])), np.array([1.0, 0, np.pi / 2 + relative]))
+        if k == 0:
+            moved = np.zeros(3)
+        action = Action.CREATE if k < 4 else Action.LINK if k == 4 else Action.SET
+        fold(world, moved, action, k % 4, sign * relative)
+
+
+@pytest.mark.parametrize("solver", ["least_squares", "relaxation"])
+def test_relative_headings_are_subtracted(solver):
+    config = ExperienceConfig.model_validate({"solver": {"name": solver}})
+    errors = {}
+    for sign in (1.0, -1.0):
+        world = ExperienceMap(config)
+        square(world, sign)
+        corners = world.nodes()[:, :2]
+        sides = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
+        errors[sign] = np.abs(sides - 1).max()
+    assert errors[1.0] < 1e-6
+    assert errors[-1.0] > 0.05
+
+
+def test_traversals_are_evidence_in_either_direction():
+    world = ExperienceMap()
+    fold(world, (0, 0, 0), Action.CREATE, 0)
+    fold(world, (1.0, 0, 0), Action.CREATE, 1, dt=2.0)
+    fold(world, (-1.2, 0, 0), Action.SET, 0, dt=3.0)
+    edges = world.edges()
+    assert len(edges.i) == 1
+    link = world.graph().edges[0, 1]
+    assert link["traversals"] == 2
+    assert link["duration"] == 5.0
+    assert 1.0 < link["dx"] < 1.2
+
+
+def test_motion_before_the_first_node_counts_once_and_new_places_solve_nothing(monkeypatch):
+    monkeypatch.setattr("ratslam.classic.experience_map.least_squares", None)
+    world = ExperienceMap()
+    fold(world, (0.5, 0, 0))
+    fold(world, (0.5, 0, 0), Action.CREATE, 0)
+    fold(world, (1.0, 0, 0), Action.CREATE, 1)
+    assert np.allclose(world.nodes()[:, 0], [1.0, 2.0])
+    assert np.allclose(world.edges().motion[0], [1.0, 0, 0])
+
+
+@pytest.mark.parametrize("stop", [1, 5, 6, 11])
+def test_a_restored_map_continues_bit_for_bit(stop):
+    def play(world, start, end):
+        stream = np.random.default_rng(1)
+        for k in range(end):
+            moved = stream.normal(0, 1, 3)
+            if k >= start:
+                fold(world, moved, Action.CREATE if k < 5 else Action.LINK, k % 5, 0.1)
+        return world
+
+    whole = play(ExperienceMap(), 0, 15)
+    second = ExperienceMap()
+    second.restore(play(ExperienceMap(), 0, stop).arrays())
+    play(second, stop, 15)
+    for name, value in whole.arrays().items():
+        assert np.array_equal(value, second.arrays()[name]), name
+
+
+def test_invalid_odometry_changes_nothing():
+    world = ExperienceMap()
+    fold(world, (0, 0, 0), Action.CREATE, 0)
+    fold(world, (np.nan, 0, 0))
+    pose = fold(world, (1, 0, 0), Action.LINK, 77)
+    assert np.allclose(pose, [1, 0, 0])
+    assert len(world.nodes()) == 1
+
+
+# Relaxation
+
+
+def links(poses, ends):
+    motion = between(poses[ends[:, 0]], poses[ends[:, 1]])
+    length, bearing = np.hypot(motion[:, 0], motion[:, 1]), np.arctan2(motion[:, 1], motion[:, 0])
+    return ends[:, 0], ends[:, 1], length, bearing, motion[:, 2]
+
+
+@given(seed=st.integers(0, 2**32 - 1), correction=st.floats(0.05, 1), loops=st.integers(0, 5))
+def test_the_sweep_is_that_of_the_stock_engine(seed, correction, loops):
+    """Order, signs and shares."""
+    rng = np.random.default_rng(seed)
+    poses = rng.uniform(-3, 3, (12, 3))
+    ends = np.array([rng.permutation(12)[:2] for _ in range(20)])
+    table = links(rng.uniform(-3, 3, (12, 3)), ends)
+    ours = relax(poses, table, loops, correction)
+    stock = StockMap(Parameters(exp_correction=correction, exp_loops=loops))
+    stock.x, stock.y, stock.th = poses.T.tolist()
+    stock.outgoing = [[Link(*row, time=0.0) for row in zip(*table, strict=True)]]
+    stock.relax()
+    np.testing.assert_allclose(ours[:, :2], np.column_stack([stock.x, stock.y]), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(wrap(ours[:, 2] - stock.th), 0, atol=1e-12)
+
+
+def test_empty_graphs_are_unchanged():
+    none = np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0), np.zeros(0)
+    assert relax(np.ones((1, 3)), none, 3, 0.5).tolist() == [[1.0, 1.0, 1.0]]
+    assert relax(np.zeros((0, 3)), none, 3, 0.5).shape == (0, 3)
+
+
+# Places
+
+CONFIG = PlaceConfig(radius=2.0, radius_heading=3.0)
+RINGS = np.array([11.0, 11.0, 36.0])
+DECIDE = jax.jit(lambda *inputs: decide(CONFIG, RINGS, *inputs))
+A, B, C = (1.0, 1, 1), (5.0, 5, 1), (8.0, 1, 20)
+
+
+def walk(visits, capacity=8):
+    """The store, and places, previous places, actions and room after (packet, template, seen) or (packet,
+    template)."""
+    store, decisions = empty_store(capacity, np.dtype(float)), []
+    for packet, template, *seen in visits:
+        seen = jnp.bool_(seen[0] if seen else True)
+        store, decision = DECIDE(store, jnp.asarray(packet, float), jnp.int32(template), seen)
+        decisions.append([int(one) for one in decision])
+    return store, *zip(*decisions, strict=True)
+
+
+def assert_same(one, other):
+    for name, value in one._asdict().items():
+        assert np.array_equal(value, getattr(other, name)), name
+
+
+ALONG = 0.25, 2.0, 2.6, 3.0, 3.000001, 5.0, 10.75
+"""Within, at and beyond the radius of 1, half-way to 3, nearer to 3, and on both sides of the seam."""
+PACKETS = [(1.0, 1.0, 0.0), *((x, 1.0, 0.0) for x in ALONG), *((1.0, y, 0.0) for y in ALONG)]
+PACKETS += [(1.0, 1.0, heading) for heading in (2.0, 2.9, 3.0, 3.000001, 5.0, 35.0)]
+packets = st.sampled_from(PACKETS)
+
+
+@given(st.lists(st.tuples(packets, st.integers(0, 1)), min_size=20, max_size=40))
+def test_decisions_are_those_of_the_plain_engine(visits):
+    plain = PlainPlaces(Parameters(pc_dim_xy=11, pc_dim_th=36), heading_radius=3.0)
+    actions, at = zip(*((plain.act(*visit), plain.current) for visit in visits), strict=True)
+    store, found, previous, did, room = walk(visits, capacity=64)
+    assert (did, found, previous) == (actions, at, (-1, *at[:-1]))
+    assert all(room)
+    count = len(plain.places)
+    assert np.array_equal(store.packet[:count], [place.packet for place in plain.places])
+    assert np.array_equal(store.template[:count], [place.template for place in plain.places])
+    assert (store.template[count:] == -1).all()
+    assert int(store.links) == len(plain.joined)
+    assert {frozenset(pair) for pair in np.asarray(store.link)[: len(plain.joined)].tolist()} == plain.joined
+
+
+def test_without_a_view_nothing_is_decided():
+    """Unseen steps leave the store as it is, wherever the packet is."""
+    store, *_ = walk([(A, 0), (B, 1)])
+    after, at, _, actions, _ = walk([(A, 0), (B, 1), (C, 7, False), (A, 0, False)])
+    assert (actions[2:], at[2:]) == ((Action.NONE,) * 2, (1, 1))
+    assert_same(store, after)
+
+
+def test_a_full_store_is_reported_and_overwrites_nothing():
+    """Without room no place is created, the current one stays, and known ones are still reached."""
+    store, *_ = walk([(A, 0), (B, 1)], capacity=2)
+    after, at, _, actions, room = walk([(A, 0), (B, 1), (C, 2), (A, 0)], capacity=2)
+    assert room == (1, 1, 0, 1)
+    assert (actions[2:], at[2:]) == ((Action.NONE, Action.SET), (1, 0))
+    assert_same(after._replace(current=store.current), store)
