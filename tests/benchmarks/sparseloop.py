@@ -9,9 +9,8 @@ from numba import njit
 
 def kernel(width: int, sigma: float) -> np.ndarray:
     at = np.arange(width) - width // 2
-    weight = np.exp(
-        -(at[:, None, None] ** 2 + at[None, :, None] ** 2 + at[None, None, :] ** 2) / (2 * sigma**2)
-    )
+    squares = at[:, None, None] ** 2 + at[None, :, None] ** 2 + at[None, None, :] ** 2
+    weight = np.exp(-squares / (2 * sigma**2))
     return weight / weight.sum()
 
 
@@ -20,65 +19,46 @@ def scatter(p, weight, out):
     k, n, m = p.shape
     half = weight.shape[0] // 2
     out[:] = 0.0
-    for h in range(k):
-        for y in range(n):
-            for x in range(m):
-                value = p[h, y, x]
-                if value == 0.0:
-                    continue
-                for a in range(weight.shape[0]):
-                    i = (h + a - half) % k
-                    for b in range(weight.shape[0]):
-                        j = (y + b - half) % n
-                        for c in range(weight.shape[0]):
-                            out[i, j, (x + c - half) % m] += value * weight[a, b, c]
+    for h, y, x in np.ndindex(k, n, m):
+        if p[h, y, x] != 0.0:
+            for a, b, c in np.ndindex(weight.shape):
+                i, j = (h + a - half) % k, (y + b - half) % n
+                out[i, j, (x + c - half) % m] += p[h, y, x] * weight[a, b, c]
 
 
 @njit(cache=False)
 def threshold(p, q, g):
     total = 0.0
-    k, n, m = p.shape
-    for h in range(k):
-        for y in range(n):
-            for x in range(m):
-                left = p[h, y, x] - q[h, y, x]
-                left = left - g if left >= g else 0.0
-                p[h, y, x] = left
-                total += left
-    for h in range(k):
-        for y in range(n):
-            for x in range(m):
-                p[h, y, x] /= total
+    for cell in np.ndindex(p.shape):
+        left = p[cell] - q[cell]
+        p[cell] = left - g if left >= g else 0.0
+        total += p[cell]
+    for cell in np.ndindex(p.shape):
+        p[cell] /= total
 
 
 @njit(cache=False)
 def integrate(p, out, d, turn):
     k, n, m = p.shape
     out[:] = 0.0
+    st, at = (1 if turn >= 0 else -1), abs(turn)
     for h in range(k):
         angle = h * 2 * np.pi / k
         dx, dy = d * np.cos(angle), d * np.sin(angle)
-        sx, sy = (1 if dx >= 0 else -1), (1 if dy >= 0 else -1)
-        st = 1 if turn >= 0 else -1
-        ax, ay, at = abs(dx), abs(dy), abs(turn)
-        for y in range(n):
-            for x in range(m):
-                value = p[h, y, x]
-                for i, wt in ((h, 1 - at), ((h + st) % k, at)):
-                    for j, wy in ((y, 1 - ay), ((y + sy) % n, ay)):
-                        out[i, j, x] += value * wt * wy * (1 - ax)
-                        out[i, j, (x + sx) % m] += value * wt * wy * ax
+        sx, sy, ax, ay = (1 if dx >= 0 else -1), (1 if dy >= 0 else -1), abs(dx), abs(dy)
+        for y, x in np.ndindex(n, m):
+            for i, wt in ((h, 1 - at), ((h + st) % k, at)):
+                for j, wy in ((y, 1 - ay), ((y + sy) % n, ay)):
+                    out[i, j, x] += p[h, y, x] * wt * wy * (1 - ax)
+                    out[i, j, (x + sx) % m] += p[h, y, x] * wt * wy * ax
 
 
 @njit(cache=False)
 def peak(p):
     best, where = -1.0, (0, 0, 0)
-    k, n, m = p.shape
-    for h in range(k):
-        for y in range(n):
-            for x in range(m):
-                if p[h, y, x] > best:
-                    best, where = p[h, y, x], (h, y, x)
+    for cell in np.ndindex(p.shape):
+        if p[cell] > best:
+            best, where = p[cell], cell
     return where
 
 

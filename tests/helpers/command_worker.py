@@ -38,10 +38,9 @@ class CommandWorker:
 
     def _start(self) -> None:
         code = "from tests.helpers.command_worker import serve; serve()"
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+        command, environment = [sys.executable, "-c", code], os.environ | {"PYTHONPATH": str(ROOT)}
+        self._process = subprocess.Popen(command, env=environment, **pipes)
         self._answer(ROOT, 600.0, LONG)  # until it has imported the program
 
     def run(self, folder: Path, *command: object, long: float = LONG) -> Outcome:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +22,8 @@ EYE, HEIGHT = 0.6, 2.2  # m above the floor: camera, ceiling
 
 @dataclass(frozen=True)
 class CorridorLoop:
-    """A corridor between an outer and an inner rectangle, and a drive along its middle.
-
-    Attributes:
-        seed: of textures, noise and wheel errors. length, depth: outer walls, m. breadth: of the corridor, m.
-        laps: times round. speed: m/s. rate: frames per second. radius: of the corners of the path, m.
-    """
+    """A corridor between two rectangles, and a drive along its middle: m, m/s, frames a second,
+    and the radius of the corners of the path, m."""
 
     seed: int
     length: float = 8.0
@@ -79,8 +76,7 @@ class CorridorLoop:
 
     @cached_property
     def textures(self) -> list[np.ndarray]:
-        """Grey values in 0..1 of a surface of 41 m x 5 m at each level, repeated beyond: walls at their own
-        offset."""
+        """Grey values in 0..1 of a surface of 41 m x 5 m at each level, repeated beyond."""
         random = np.random.default_rng([self.seed, 0])
         size = (256, 2048)
         total = np.zeros(size)
@@ -96,11 +92,8 @@ class CorridorLoop:
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera of `fov_deg` degrees across `width` pixels; 360: a cylinder, else a pinhole.
-
-    Attributes:
-        exposure: factor on the light; pixels saturate. noise: standard deviation of a pixel, grey values.
-    """
+    """A camera of `fov_deg` degrees across `width` pixels; 360: a cylinder, else a pinhole. `exposure` is a
+    factor on the light, `noise` the standard deviation of a pixel, grey values."""
 
     fov_deg: float = 60.0
     width: int = 640
@@ -175,28 +168,16 @@ def write_video(
     """Writes grey frames as a video and returns their number; `MJPG` stores each as a JPEG."""
     import cv2
 
-    writer, count = None, 0
-    for frame in frames:
-        if writer is None:
-            size = frame.shape[1], frame.shape[0]
-            writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), rate, size)
-            assert writer.isOpened()
-            writer.set(cv2.VIDEOWRITER_PROP_QUALITY, quality)
+    first = next(frames)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), rate, first.shape[::-1])
+    assert writer.isOpened()
+    writer.set(cv2.VIDEOWRITER_PROP_QUALITY, quality)
+    count = 0
+    for frame in chain([first], frames):
         writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
         count += 1
-    if writer is not None:
-        writer.release()
+    writer.release()
     return count
-
-
-def stored_frames(path: Path) -> Iterator[bytes]:
-    """The frames of a video as they are stored: of `MJPG`, JPEG files."""
-    import cv2
-
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
-    while (frame := video.read())[0]:
-        yield frame[1].tobytes()
-    video.release()
 
 
 def write_csv(path: Path, **columns: np.ndarray) -> Path:

@@ -33,7 +33,7 @@ def create(whiskers: int = len(MOUNTS)) -> PlanarWhiskers:
     """The first few feelers of a Create."""
     mounts = np.array(MOUNTS)[:whiskers]
     angle = np.radians(mounts[:, 2])
-    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    direction = np.column_stack([np.cos(angle), np.sin(angle)])
     return PlanarWhiskers(mounts[:, :2], direction, np.full(len(mounts), LENGTH))
 
 
@@ -52,20 +52,11 @@ def report(
     motion: MotionKind | None = None,
     whiskers: int = len(MOUNTS),
 ) -> Observation:
-    """One report of a Create.
-
-    Args:
-        forward: m. turn: rad. touching: whiskers in contact. wall: distance m and bearing rad of its nearest
-            point. sd: of its direction, rad. dead: whiskers that do not report. motion: its kind.
-    """
+    """One report of a Create: whiskers `touching`, distance m and bearing rad of the nearest point of a wall,
+    the standard deviation of its direction, rad, `dead` whiskers, and the kind of motion."""
     if motion is None:
-        motion = (
-            MotionKind.BACK
-            if forward < 0
-            else MotionKind.TURN
-            if turn and not forward
-            else MotionKind.FORWARD
-        )
+        turning = MotionKind.TURN if turn and not forward else MotionKind.FORWARD
+        motion = MotionKind.BACK if forward < 0 else turning
     plain = observation(Odometry(forward, 0.0, turn, 0.5), motion=motion, whiskers=whiskers)
     marked = np.arange(whiskers)
     contact = np.isin(marked, touching)

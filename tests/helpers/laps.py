@@ -21,14 +21,10 @@ def square(word, side=12):
 
 
 def session(truth, **given):
-    still = {
-        "truth": truth,
-        "odometry": truth,
-        "trajectory": truth,
+    still = dict.fromkeys(("truth", "odometry", "trajectory", "node", "live"), truth)
+    still |= {
         "place": np.arange(len(truth)),
-        "node": truth,
-        "closures": np.zeros((0, 2), int),
-        "live": truth,
         "piece": np.zeros(len(truth), int),
+        "closures": np.zeros((0, 2), int),
     }
-    return SessionResult(**{**still, **given})
+    return SessionResult(**still | given)

@@ -7,8 +7,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -60,15 +60,16 @@ class Faults:
 
 
 @contextmanager
-def emulator(module: str, port: int, host: str, *arguments: str) -> Iterator[Faults]:
-    """A running `python -m MODULE --host HOST ...` that has printed `ready`; it ends with the block."""
-    command = [sys.executable, "-m", module, "--host", host, *arguments]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, bufsize=0)
+def started(command: Sequence[str], port: int, host: str) -> Iterator[Faults]:
+    """The fault port of an emulator that `python COMMAND` has started; it ends with the block."""
+    process = subprocess.Popen(
+        [sys.executable, *command], cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, bufsize=0
+    )
     faults = Faults(process, host, port)
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
-        assert line.strip() == b"ready", f"{module} does not start; does another one hold {host}?"
+        assert line.strip().endswith(b"ready"), f"it does not start; does another one hold {host}? {command}"
         yield faults
     finally:
         faults.close()
@@ -76,6 +77,11 @@ def emulator(module: str, port: int, host: str, *arguments: str) -> Iterator[Fau
         process.wait(PATIENCE)
         assert process.stdout is not None
         process.stdout.close()
+
+
+def emulator(module: str, port: int, host: str, *arguments: str) -> AbstractContextManager[Faults]:
+    """A running `python -m MODULE --host HOST ...`."""
+    return started(["-m", module, "--host", host, *arguments], port, host)
 
 
 def ur_emulator(host: str, start: Any, *arguments: str) -> Any:

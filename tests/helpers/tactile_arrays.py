@@ -50,11 +50,7 @@ class _Contacts(NamedTuple):
 
 
 def taxel_pressures(head: Head, push: np.ndarray, contacts: _Contacts) -> np.ndarray:
-    """[N, 3, 22, 1] forces on taxels, N; a contact between two taxels presses both.
-
-    Args:
-        push: [N, W] force of each whisker, N.
-    """
+    """[N, 3, 22, 1] forces on taxels, N, of whiskers that push [N, W], N; one between two presses both."""
     columns = head.shape[1]
     azimuth = np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0])
     middle = 2 * np.pi * np.arange(COLUMNS) / COLUMNS
@@ -65,11 +61,7 @@ def taxel_pressures(head: Head, push: np.ndarray, contacts: _Contacts) -> np.nda
 
 
 def wrenches(head: Head, push: np.ndarray, contacts: _Contacts) -> np.ndarray:
-    """[N, 1, 6, 1] force (N) and torque (N m) of all whiskers on the head, about the origin of base_link.
-
-    Args:
-        push: [N, W] force of each whisker, N.
-    """
+    """[N, 1, 6, 1] force (N) and torque (N m) about base_link of whiskers that push [N, W], N."""
     angle = np.nan_to_num(contacts.angle)
     ahead = np.cos(angle)[..., None] * head.swing - np.sin(angle)[..., None] * head.rest
     force = -push[..., None] * ahead
@@ -88,18 +80,13 @@ def _open(
     rate = config.simulation.whisking.rate
     count = round(config.rate / rate)
     whisk = np.arange(1, made.length).repeat(count)
-    time = np.concatenate(
-        [
-            made.time[:1],
-            made.time[whisk - 1] + np.tile(np.arange(1, count + 1), made.length - 1) / config.rate,
-        ]
-    )
+    later = made.time[whisk - 1] + np.tile(np.arange(1, count + 1), made.length - 1) / config.rate
+    time = np.concatenate([made.time[:1], later])
     cycle = np.clip(((time - made.start[0]) * rate + 1e-9).astype(int), 0, made.length - 1)
     touched, contact, reach = made.features.touched, made.features.contact, made.features.reach
     contacts = _Contacts(np.where(contact, touched, np.nan)[cycle], (reach * made.head.length)[cycle])
-    command = np.radians(config.simulation.whisking.amplitude_deg) * whisk_phase(
-        config.simulation.whisking, time % (1 / rate)
-    )
+    whisking = config.simulation.whisking
+    command = np.radians(whisking.amplitude_deg) * whisk_phase(whisking, time % (1 / rate))
     push = STIFFNESS * np.maximum(np.nan_to_num(command[:, None] - contacts.angle, nan=0.0), 0.0)
     views = response(made.head, push, contacts)
     views += scale * config.noise * stream(config.simulation.seed, name).standard_normal(views.shape)
@@ -168,11 +155,9 @@ class WrenchFrontend:
     def observe(self, reading: Observation) -> Observation | None:
         """The mean, after the last of its samples."""
         self._motion = compose(self._motion, np.array(reading.odometry[:3]))
-        self._dt, self._sum, self._count = (
-            self._dt + reading.odometry.dt,
-            self._sum + reading.view,
-            self._count + 1,
-        )
+        self._dt += reading.odometry.dt
+        self._sum += reading.view
+        self._count += 1
         if self._count < self.frames:
             return None
         view = np.clip(0.5 + self._sum / self._count / (2 * self.full), 0, 1)
