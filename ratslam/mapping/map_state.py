@@ -152,8 +152,8 @@ class MapState(Checkpointed):
         self._archive_newest()
 
     def begin_piece(self) -> None:
-        """Adds a keyframe to which no odometry leads, as the start of a new piece (`piece_placement`); an
-        empty graph gets its first keyframe."""
+        """Adds a keyframe to which no odometry leads, as the start of a new piece (`placed_pieces`); an
+        empty map gets its first keyframe."""
         self.reckoned = self.next_start()
         motion = between(self.pose.rows[-1], self.reckoned) if self.count else np.zeros(3)
         self._append_row(self.reckoned, motion, 0.0, 0.0, -1, self.count > 0, False, self.total)
