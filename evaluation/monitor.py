@@ -17,8 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.manifest import RUNNING, read_manifest
-from evaluation.artifacts.run_reader import check_run_directory, checkpoint_steps, read_walls
+from evaluation.artifacts.run_reader import (
+    RUNNING,
+    check_run_directory,
+    checkpoint_steps,
+    read_manifest,
+    read_walls,
+)
 from evaluation.metrics.run_metrics import DOUBTED, path_length
 from evaluation.metrics.trajectory import align
 from evaluation.plots import style

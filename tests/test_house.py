@@ -21,7 +21,7 @@ ROOMS = sorted(
 )
 LONGEST_FILE, LONGEST_FUNCTION, LONGEST_ROOT_README = 600, 80, 1200
 MOST = {
-    "rooms": 30, "folders": 50, "files": 415, "product lines": 76_600, "code lines": 51_720,
+    "rooms": 30, "folders": 50, "files": 408, "product lines": 76_600, "code lines": 51_720,
     "test lines": 48_400, "public names": 1_841, "all names": 2_940, "records": 300,
     "short and called once": 55,
     "twin names": 0, "module circles": 0, "room circles": 0, "upward arrows": 0,

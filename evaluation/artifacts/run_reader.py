@@ -1,23 +1,27 @@
-"""Reads a run directory as arrays, also the incomplete one of an interrupted run.
+"""The files of a run directory as arrays and records, also those of a run that was interrupted.
 
-`pieces.csv` gives the piece of the map in which each step is; only a map of several pieces has it. A folder
-with `merge.json` holds a map merged of several sessions and is no run.
+`read_run` gives poses, experiences and truth; `read_manifest` what was run and how it ended;
+`read_closure_table` all loop closures that the map considered (`closures.csv`); `read_changes` the places at
+which a session does not agree with its map (`changes.csv`); `read_closure_views` and `read_whisker_views` the
+images. `pieces.csv` gives the piece of the map in which each step is; only a map of several pieces has it. A
+folder with `merge.json` holds a map merged of several sessions and is no run.
 """
 
 from __future__ import annotations
 
+import csv
+import fcntl
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.manifest import read_manifest
-from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED, RunArrays
+from evaluation.metrics.run_metrics import NOT_JUDGED, UNFINISHED, RunArrays
 from evaluation.metrics.scorecard import Scorecard
-from evaluation.metrics.text_table import LARGEST, read_text_table
 from evaluation.metrics.trajectory import read_tum
-from tactile.base.bounded import read_json, read_npz, read_text
+from tactile.base.bounded import LARGEST_NUMBER, read_json, read_npz, read_rows, read_text, read_text_table
 from tactile.base.errors import InputError
 
 PIECES = "pieces.csv"
@@ -226,7 +230,7 @@ def read_columns(path: Path, *names: str, empty: float | None = None) -> list[np
             at = fields.index(name)
             cells = [row[at] for row in rows]
             column = np.array([empty if empty is not None and cell == "" else float(cell) for cell in cells])
-            if ((np.abs(column) > LARGEST) & np.isfinite(column)).any():
+            if ((np.abs(column) > LARGEST_NUMBER) & np.isfinite(column)).any():
                 raise ValueError
         except (ValueError, IndexError):
             cause = f"a row without a number in column {name}"
@@ -266,3 +270,303 @@ def _graph(content: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if links.size and (links.dtype.kind != "i" or links.min() < 0 or links.max() >= len(nodes)):
         raise ValueError("a link to no node")
     return nodes, links.astype(int), piece
+
+
+SESSION_REPORT = "live.json"
+"""Report of a live session, written when it has ended."""
+RUNNING = "running"
+"""Status of a run that has not ended, or was killed."""
+
+
+class Manifest(NamedTuple):
+    """The manifest of a run.
+
+    Attributes:
+        status: `running`, `complete` or `interrupted`; of a live session that ended before its map was
+            finished, the outcome from its report. source: name of the recording or simulation.
+        total: final number of steps, if known. seed: of the session, if known.
+        versions: of the program, its libraries and Python. continued: whether it went on from a map.
+        killed: it has not ended, and no process writes it. digest: sha256 of its recording or simulation,
+            '' of a live session. warnings: about the input, a sentence each.
+    """
+
+    status: str = RUNNING
+    source: str = ""
+    total: int | None = None
+    seed: int | None = None
+    versions: Mapping[str, str] = {}
+    continued: bool = False
+    killed: bool = False
+    digest: str = ""
+    warnings: tuple[str, ...] = ()
+
+
+def read_manifest(directory: Path) -> Manifest:
+    """Reads the manifest; that of a run without the file has no versions.
+
+    Raises:
+        InputError: the file, or the report of a live session, is malformed.
+    """
+    file = directory / "manifest.json"
+    found = read_json(file, "the manifest of a run", _parse_manifest) if file.exists() else Manifest()
+    if found.status != RUNNING:
+        return found
+    killed, report = file.exists() and _is_left(directory / "steps.csv"), directory / SESSION_REPORT
+    if not report.exists():
+        return found._replace(killed=killed)
+    outcome = read_json(report, "the report of a live session", lambda content: str(content["outcome"]))
+    return found._replace(killed=killed, status=outcome)
+
+
+def _parse_manifest(content: Any) -> Manifest:
+    recording, versions, seed = content["recording"], content.get("versions", {}), content.get("seeds", {})
+    total = None if content["continued"] else recording["samples"]
+    return Manifest(
+        status=str(content["status"]),
+        source=str(recording.get("name", "")),
+        total=None if total is None else int(total),
+        seed=None if seed.get("session") is None else int(seed["session"]),
+        versions={str(name): str(version) for name, version in versions.items()},
+        continued=bool(content["continued"]),
+        digest=str(recording.get("sha256", "")),
+        warnings=tuple(map(str, content.get("input", {}).get("warnings", ()))),
+    )
+
+
+def _is_left(file: Path) -> bool:
+    """Whether no process holds the lock of a run; False where that cannot be told."""
+    try:
+        with file.open("rb") as opened:
+            fcntl.flock(opened, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return True  # before its first line
+    except OSError:
+        return False
+    return True
+
+
+ACCEPTED = "accepted"
+"""Verdict on the closures of the map."""
+CLOSURE_COLUMNS = ("step", "match_step", "verdict")
+"""Columns that every closures.csv has; a map may add columns of numbers."""
+
+
+class ClosureTable(NamedTuple):
+    """The closures of a run, n of them, in the order of the file.
+
+    Attributes:
+        steps: [n, 2] the earlier and the later step that a closure joins, counted from the first step of
+            this run: negative in the run that this one continues.
+        verdicts: [n] `accepted`, or why it is no closure of the map.
+        evidence: the other columns, [n] each, by name.
+    """
+
+    steps: np.ndarray
+    verdicts: list[str]
+    evidence: Mapping[str, np.ndarray]
+
+    def accepted(self) -> np.ndarray:
+        """[n] bool, which are closures of the map."""
+        return np.array([verdict == ACCEPTED for verdict in self.verdicts], bool)
+
+
+def read_closure_table(directory: Path) -> ClosureTable:
+    """Reads the closures of a run directory; none without the file.
+
+    Raises:
+        InputError: a line is malformed.
+    """
+    file = directory / "closures.csv"
+    if not file.exists():
+        return ClosureTable(np.zeros((0, 2), int), [], {})
+
+    def parse(row: Mapping[str, str]) -> tuple[list[int], str, dict[str, float]]:
+        pair = [int(np.int32(row[name])) for name in ("match_step", "step")]
+        return (
+            pair,
+            str(row["verdict"]),
+            {name: float(row[name]) for name in row if name not in CLOSURE_COLUMNS},
+        )
+
+    rows = read_rows(file, "the columns step, match_step, verdict, and numbers in all others", parse)
+    names = rows[0][2] if rows else {}
+    evidence = {name: np.array([cells[name] for _, _, cells in rows]) for name in names}
+    steps = np.array([pair for pair, _, _ in rows], int).reshape(-1, 2) - first_step(directory)
+    return ClosureTable(steps, [verdict for _, verdict, _ in rows], evidence)
+
+
+def read_closures(directory: Path) -> np.ndarray:
+    """The pairs of steps [n, 2] of this run that are joined by accepted closures; n is 0 without the file.
+
+    Raises:
+        InputError: a line is malformed.
+    """
+    table = read_closure_table(directory)
+    return table.steps[table.accepted() & (table.steps >= 0).all(axis=1)]
+
+
+def write_closure_pairs(path: Path, pairs: np.ndarray) -> None:
+    """Writes accepted closures without evidence: pairs [n, 2] of steps, the later and the earlier."""
+    lines = (f"{later},{earlier},{ACCEPTED}\n" for later, earlier in pairs.tolist())
+    Path(path).write_text("".join([",".join(CLOSURE_COLUMNS) + "\n", *lines]), encoding="utf-8")
+
+
+class Closures(NamedTuple):
+    """Loop closures of a run: proposed and accepted ones, and sequences of both."""
+
+    proposed: int
+    accepted: int
+    sequences: int
+    accepted_sequences: int
+
+
+def count_closures(path: Path) -> Closures | None:
+    """The loop closures in closures.csv; None if there are none, as of a method that proposes none."""
+    if not (path / "closures.csv").exists():
+        return None
+    table = read_closure_table(path)
+    accepted = table.accepted()
+    sequence = table.evidence.get("sequence", np.arange(len(accepted)))
+    sequences = len(np.unique(sequence)), len(np.unique(sequence[accepted]))
+    return Closures(len(accepted), int(accepted.sum()), *sequences)
+
+
+CHANGES = "changes.csv"
+CHANGE_COLUMNS = ("x", "y", "extent", "kind", "evidence", "alarms", "passes", "first_step", "last_step")
+"""m, m, m; `new`, `gone` or `different`; nat; expected number by chance; number of passes; steps of the
+session that contradict."""
+
+
+class ChangeRow(NamedTuple):
+    """One place, see `CHANGE_COLUMNS`."""
+
+    x: float
+    y: float
+    extent: float
+    kind: str
+    evidence: float
+    alarms: float
+    passes: int
+    first_step: int
+    last_step: int
+
+    @classmethod
+    def parse(cls, line: Mapping[str, str]) -> ChangeRow:
+        """The place of a line of the file; a ValueError for a line that is malformed."""
+        numbers = [float(line[name]) for name in ("x", "y", "extent", "evidence", "alarms")]
+        if not np.isfinite(numbers).all():
+            raise ValueError("a number that is not finite")
+        x, y, extent, evidence, alarms = numbers
+        passes, first, last = (int(np.int32(line[name])) for name in ("passes", "first_step", "last_step"))
+        return cls(x, y, extent, str(line["kind"]), evidence, alarms, passes, first, last)
+
+    def describe(self) -> str:
+        """The place in one line."""
+        what = {"new": "something new", "gone": "something gone"}.get(self.kind, "something different")
+        where = f"({self.x:.2f}, {self.y:.2f}) m, {self.extent:.2f} m long"
+        when = f"{self.passes} passes, steps {self.first_step} to {self.last_step}"
+        return f"changed: {what} at {where}, {when}, evidence {self.evidence:.0f} nat"
+
+
+def write_changes(path: Path, changes: Sequence[ChangeRow]) -> None:
+    """Writes the places, the surest first."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([CHANGE_COLUMNS, *changes])
+
+
+def read_changes(path: Path) -> list[ChangeRow]:
+    """Reads the places.
+
+    Raises:
+        InputError: a line is malformed.
+    """
+    return read_rows(path, f"the columns {', '.join(CHANGE_COLUMNS)}", ChangeRow.parse)
+
+
+CLOSURE_VIEWS = "closure_views.npz"
+
+
+class ClosureViews(NamedTuple):
+    """Views of n steps.
+
+    Attributes:
+        step: [n] increasing, counted from the first step of this run.
+        view: [n, R, C] uint8, brightness.
+    """
+
+    step: np.ndarray
+    view: np.ndarray
+
+
+def eight_bit(view: np.ndarray) -> np.ndarray:
+    """A view [R, C, K] in 0..1 as an image [R, C] of its first channel in 0..255; only 0 becomes 0."""
+    return np.ceil(255 * np.clip(view[..., 0], 0.0, 1.0)).astype(np.uint8)
+
+
+def write_closure_views(path: Path, views: ClosureViews) -> None:
+    """Writes the file; equal views give equal bytes."""
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, step=views.step, view=views.view)
+
+
+def read_closure_views(directory: Path) -> ClosureViews | None:
+    """Reads the views of a run directory; None without the file.
+
+    Raises:
+        InputError: the file is malformed.
+    """
+
+    def parse(step: np.ndarray, view: np.ndarray) -> ClosureViews:
+        if step.ndim != 1 or view.ndim != 3 or len(step) != len(view) or view.dtype != np.uint8:
+            raise ValueError("arrays that do not fit each other")
+        return ClosureViews(step.astype(int), view)
+
+    file = directory / CLOSURE_VIEWS
+    expected = "the views of a run directory: step [n] and view [n, R, C] of 8 bits"
+    return read_npz(file, ClosureViews._fields, parse, expected) if file.exists() else None
+
+
+_WHITE = 255
+
+
+class WhiskerViews(NamedTuple):
+    """Whisker images of N steps and a head with R rings of C whiskers.
+
+    Attributes:
+        view: [N, R, C] pixel values in 0..1, 0 without contact.
+        alive: [N, R, C] bool, the whisker has a signal.
+        azimuth: [C] direction of the whiskers of each column, rad counter-clockwise from ahead.
+        length: [R] length of the whiskers of each ring, m. tallest: obstacle height of pixel value 1, m.
+    """
+
+    view: np.ndarray
+    alive: np.ndarray
+    azimuth: np.ndarray
+    length: np.ndarray
+    tallest: float
+
+
+def write_whisker_views(path: str | Path, images: WhiskerViews) -> None:
+    """Writes an .npz file with pixel values in 255 steps; equal images give equal bytes."""
+    arrays = {name: np.asarray(array) for name, array in images._asdict().items()}
+    # Rounded up, so that a whisker in contact is never 0.
+    arrays["view"] = np.ceil(_WHITE * images.view).astype(np.uint8)
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_whisker_views(path: str | Path) -> WhiskerViews:
+    """The inverse of `write_whisker_views`, except for rounding.
+
+    Raises:
+        InputError: the file is missing or malformed.
+    """
+
+    def parse(view: np.ndarray, *arrays: np.ndarray) -> WhiskerViews:
+        alive, azimuth, length, tallest = arrays
+        rings, columns = view.shape[1:]
+        if (length.shape, azimuth.shape, alive.shape) != ((rings,), (columns,), view.shape):
+            raise ValueError("arrays that do not fit each other")
+        return WhiskerViews(view / _WHITE, alive, azimuth, length, float(tallest))
+
+    return read_npz(path, WhiskerViews._fields, parse, "the views.npz of a run directory")

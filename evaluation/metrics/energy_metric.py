@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.text_table import read_text_table
 from evaluation.metrics.trajectory import interpolate, motion_errors
+from tactile.base.bounded import read_text_table
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap
 

@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import NonNegativeInt, PositiveFloat
 
-from evaluation.metrics.text_table import read_text_table
+from tactile.base.bounded import read_text_table
 from tactile.base.errors import InputError
 from tactile.base.se2 import wrap
 from tactile.base.settings import Settings

@@ -11,11 +11,11 @@ import numpy as np
 from evaluation.metrics.energy_metric import Relations
 from evaluation.metrics.exm import DEFAULT_EXM, ExmConfig
 from evaluation.metrics.metric import MISSING_TRUTH, Finding, Metric, Quantity
-from evaluation.metrics.run_arrays import RunArrays
 from evaluation.metrics.run_metrics import (
     DOUBTED,
     PIECES,
     RUN_METRICS,
+    RunArrays,
     experience_findings,
     path_length,
     run_data,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.metrics.text_table import read_text_table
+from tactile.base.bounded import read_text_table
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose, fit_rigid_motion, tum_line, wrap
 

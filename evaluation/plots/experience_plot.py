@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from evaluation.metrics.exm import ExperienceMetric, experience_metric
-from evaluation.metrics.run_arrays import RunArrays
+from evaluation.metrics.run_metrics import RunArrays
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREY, INK, LINE_GREY, VERMILLION

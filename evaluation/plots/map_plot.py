@@ -4,18 +4,17 @@ localised session does not agree with its map; the sessions of a merged map; a w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import ChangeRow
-from evaluation.metrics.run_arrays import RunArrays
-from evaluation.metrics.run_metrics import arrange_pieces
+from evaluation.artifacts.run_reader import ChangeRow
+from evaluation.metrics.run_metrics import IN_PLACE, Layers, RunArrays, arrange_pieces, bounds
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.metrics.trajectory import align
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
-from tactile.base.se2 import between, compose
+from tactile.base.se2 import compose
 
 _ROOM = 0.2  # share of the map's size for drifting odometry
 _JUMP = 5.0  # a step longer than this multiple of the usual one: the robot was moved by hand
@@ -24,47 +23,8 @@ NAMED = 5
 """Number of pieces of a map with a colour of their own."""
 PIECES = (BLUE, ORANGE, GREEN, PURPLE, SKY, INK)
 """Colours of the largest pieces, and of all others."""
-IN_PLACE = np.zeros(3)
 NO_WALLS = np.zeros((0, 5))
 NO_CLOSURES = np.zeros((0, 2), int)
-
-
-class Layers(NamedTuple):
-    """Positions [.., 2] (m) to draw, in the frame of the map.
-
-    `to_map` [3] moves true poses there.
-    """
-
-    truth: np.ndarray | None
-    odometry: np.ndarray
-    final: np.ndarray
-    nodes: np.ndarray
-    to_map: np.ndarray = IN_PLACE
-
-    @classmethod
-    def align(cls, run: RunArrays) -> Layers:
-        """The layers of a run: the truth aligned to the map and odometry to the truth, as for ATE; without
-        truth, odometry starts at the first pose of the map."""
-        rows = run.truth_rows
-        if run.truth is None or len(rows) == 0:
-            to_map = compose(run.final[0], between(run.odometry[0], np.zeros(3)))
-            return cls(None, _xy(compose(to_map, run.odometry)), _xy(run.final), _xy(run.nodes))
-        true = run.truth[rows]
-        to_map = align(true, run.final[rows])
-        odometry = compose(compose(to_map, align(run.odometry[rows], true)), run.odometry)
-        truth = compose(to_map, run.truth)
-        return cls(_xy(truth), _xy(odometry), _xy(run.final), _xy(run.nodes), to_map)
-
-    def box(self, room: float, *others: np.ndarray) -> np.ndarray:
-        """[[left, bottom], [right, top]] of truth, map and other points, and of odometry near them: within
-        `room`, as a share of the size."""
-        known = [self.final, self.nodes, *others] + ([] if self.truth is None else [self.truth])
-        low, high = bounds(*known)
-        margin, (far_low, far_high) = room * (high - low).max(), bounds(self.odometry)
-        if room:
-            low = np.minimum(low, np.maximum(far_low, low - margin))
-            high = np.maximum(high, np.minimum(far_high, high + margin))
-        return np.stack([low, high])
 
 
 def draw_map(
@@ -135,20 +95,10 @@ def draw_walls(axes: style.Axes, walls: np.ndarray, to_map: np.ndarray = IN_PLAC
     axes.add_collection(PolyCollection(boxes, facecolors=greys, linewidths=0, zorder=0.6))
 
 
-def bounds(*points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The minimum and maximum coordinates [2] of points [.., 2]."""
-    every = np.concatenate([part.reshape(-1, 2) for part in points])
-    return np.nanmin(every, axis=0), np.nanmax(every, axis=0)
-
-
 def wall_corners(walls: np.ndarray, to_map: np.ndarray = IN_PLACE) -> np.ndarray:
     """The four corners [B, 4, 2] of each wall [B, 5], moved by `to_map` [3]."""
     corners = walls[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 4, 2)
-    return _xy(compose(to_map, np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=-1)))
-
-
-def _xy(pose: np.ndarray) -> np.ndarray:
-    return np.asarray(pose)[..., :2]
+    return compose(to_map, np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=-1))[..., :2]
 
 
 def _paint(axes: style.Axes, run: RunArrays, layers: Layers) -> None:

@@ -8,18 +8,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import CHANGES, read_changes, read_closures
 from evaluation.artifacts.grid_files import read_grid, read_grid_truth
-from evaluation.artifacts.recorded_views import read_whisker_views
-from evaluation.artifacts.run_reader import read_run, read_scorecard, read_walls
+from evaluation.artifacts.run_reader import (
+    CHANGES,
+    read_changes,
+    read_closures,
+    read_run,
+    read_scorecard,
+    read_walls,
+    read_whisker_views,
+)
 from evaluation.cells import recording
 from evaluation.metrics.occupancy_score import GridScore
-from evaluation.metrics.run_arrays import RunArrays
-from evaluation.metrics.run_metrics import arrange_pieces
+from evaluation.metrics.run_metrics import Layers, RunArrays, arrange_pieces
 from evaluation.plots.cell_plot import draw_recorded_cells
 from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, draw_grid, grid_headline
-from evaluation.plots.map_plot import Layers, draw_changes, draw_map
+from evaluation.plots.map_plot import draw_changes, draw_map
 from evaluation.plots.whisker_plot import draw_whiskers
 from tactile.base.bounded import read_json
 from tactile.base.se2 import between

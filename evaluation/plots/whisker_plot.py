@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.artifacts.recorded_views import WhiskerViews
+from evaluation.artifacts.run_reader import WhiskerViews
 from evaluation.metrics.exm import base_end
-from evaluation.metrics.run_arrays import RunArrays
+from evaluation.metrics.run_metrics import RunArrays, bounds
 from evaluation.metrics.scorecard import Scorecard
 from evaluation.plots import style
-from evaluation.plots.map_plot import NO_WALLS, bounds, draw_walls, split_at_jumps, wall_corners
+from evaluation.plots.map_plot import NO_WALLS, draw_walls, split_at_jumps, wall_corners
 from evaluation.plots.style import GREY, INK, LABEL_GREY, LINE_GREY
 from tactile.base.errors import InputError
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import ACCEPTED
+from evaluation.artifacts.run_reader import ACCEPTED
 from evaluation.metrics.occupancy_grid import OccupancyGrid
-from evaluation.metrics.run_metrics import DOUBTED
+from evaluation.metrics.run_metrics import DOUBTED, bounds
 from evaluation.metrics.trajectory import position_errors
-from evaluation.plots.map_plot import bounds, path_pieces, split_at_jumps, wall_corners
+from evaluation.plots.map_plot import path_pieces, split_at_jumps, wall_corners
 from evaluation.report.run_report import WORDS, RunReport
 from tactile.base.se2 import compose, inverse
 

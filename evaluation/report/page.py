@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from evaluation.artifacts.manifest import RUNNING
+from evaluation.artifacts.run_reader import RUNNING
 from evaluation.report.charts import GRID_SCALES, PALETTE, error_chart, overlay_chart, run_charts
 from evaluation.report.run_report import RunReport, closure_records, view_records
 from evaluation.report.verdict import describe_score

@@ -8,11 +8,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import count_closures
-from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.run_reader import read_run
-from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED
-from evaluation.metrics.run_metrics import DOUBTED, path_length
+from evaluation.artifacts.run_reader import count_closures, read_manifest, read_run
+from evaluation.metrics.run_metrics import DOUBTED, NOT_JUDGED, UNFINISHED, path_length
 from evaluation.metrics.scorecard import Scorecard, render_error, render_health, render_warnings
 
 CAUTION = 1 - DOUBTED

@@ -23,8 +23,7 @@ from evaluation.artifacts.grid_files import read_grid
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric import Finding, Quantity
 from evaluation.metrics.occupancy_score import MAIN_CONVENTION, score_grid
-from evaluation.metrics.run_arrays import RunArrays
-from evaluation.metrics.run_metrics import anchored_errors, recognition_error
+from evaluation.metrics.run_metrics import RunArrays, anchored_errors, recognition_error
 from evaluation.metrics.scorecard import score_run
 from evaluation.studies.executor import Executor
 from evaluation.studies.machine import Machine, Stopwatch, machine, one_core, watch_machine

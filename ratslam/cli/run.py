@@ -66,7 +66,7 @@ def add_look(commands: Commands) -> None:
 
 
 def _watch(arguments: argparse.Namespace) -> None:
-    from evaluation.artifacts.manifest import RUNNING
+    from evaluation.artifacts.run_reader import RUNNING
     from evaluation.monitor import KILLED, WATCH_IMAGE, watch_run
 
     for name in ("every", "patience"):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from evaluation.artifacts.manifest import SESSION_REPORT
+from evaluation.artifacts.run_reader import SESSION_REPORT
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.live.arm_session import prepare_arm_session
 from ratslam.live.create_session import prepare_create_session

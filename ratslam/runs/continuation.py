@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from evaluation.artifacts.manifest import read_manifest
+from evaluation.artifacts.run_reader import read_manifest
 from ratslam.core.session import Session
 from ratslam.methods.map_file import NAME, map_file
 from ratslam.methods.method_registry import LOCALISING

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from evaluation.artifacts.closure_table import CHANGES, read_changes
+from evaluation.artifacts.run_reader import CHANGES, read_changes
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.core.estimates import Localisation
 from ratslam.methods.config import Start

@@ -12,9 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import write_closure_pairs
 from evaluation.artifacts.run_reader import MERGE_REPORT as MERGED
-from evaluation.artifacts.run_reader import PIECES, is_merged, read_run, read_session_steps, write_pieces
+from evaluation.artifacts.run_reader import (
+    PIECES,
+    is_merged,
+    read_run,
+    read_session_steps,
+    write_closure_pairs,
+    write_pieces,
+)
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard, score_run

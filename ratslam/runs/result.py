@@ -11,8 +11,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.run_reader import read_run, read_scorecard
+from evaluation.artifacts.run_reader import read_manifest, read_run, read_scorecard
 from evaluation.cells.recording import NAME as CELLS
 from evaluation.cells.recording import CellRecording, read_recording
 from evaluation.metrics.scorecard import Scorecard, render_health, render_warnings, scorecard_html

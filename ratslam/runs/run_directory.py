@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.artifacts import recorded_views
-from evaluation.artifacts.closure_table import CHANGES, ChangeRow, read_closure_table, write_changes
+from evaluation.artifacts import run_reader
 from evaluation.artifacts.grid_files import read_grid, write_grid_truth, write_nav2
-from evaluation.artifacts.run_reader import write_walls
+from evaluation.artifacts.run_reader import CHANGES, ChangeRow, read_closure_table, write_changes, write_walls
 from evaluation.metrics.occupancy_grid import GridTruth, OccupancyGrid, cell_centres
 from evaluation.metrics.occupancy_score import score_grid
 from evaluation.metrics.trajectory import current_error
@@ -129,23 +128,23 @@ class RunDirectory(AbstractContextManager["RunDirectory"]):
         if not views or views[0][0].shape[:2] != head.shape or len(views[0][1]) != len(head.length):
             return
         columns = head.shape[1]
-        images = recorded_views.WhiskerViews(
+        images = run_reader.WhiskerViews(
             view=np.array([view[..., 0] for view, _ in views]),
             alive=np.array([alive.reshape(head.shape) for _, alive in views]),
             azimuth=np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0]),
             length=head.length[::columns],
             tallest=config.image.tallest,
         )
-        self.file("views.npz", lambda path: recorded_views.write_whisker_views(path, images))
+        self.file("views.npz", lambda path: run_reader.write_whisker_views(path, images))
 
     def save_closure_views(self, images: Sequence[np.ndarray | None]) -> None:
-        """Writes recorded_views.npz: the images [R, C] of the steps that closures join; None: no view."""
+        """Writes closure_views.npz: the images [R, C] of the steps that closures join; None: no view."""
         joined = np.unique(read_closure_table(self.path).steps).tolist()
         seen = {step: image for step, image in enumerate(images) if image is not None}
         steps = [step for step in joined if step in seen]
         if steps:
-            views = recorded_views.ClosureViews(np.array(steps), np.stack([seen[step] for step in steps]))
-            self.file(recorded_views.NAME, lambda path: recorded_views.write_closure_views(path, views))
+            views = run_reader.ClosureViews(np.array(steps), np.stack([seen[step] for step in steps]))
+            self.file(run_reader.CLOSURE_VIEWS, lambda path: run_reader.write_closure_views(path, views))
 
     def save_grid_map(self) -> None:
         """Writes map.pgm and map.yaml if the map is a grid; if the arena and the robot's start in it are

@@ -18,8 +18,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.recorded_views import eight_bit
+from evaluation.artifacts.run_reader import eight_bit, read_manifest
 from evaluation.metrics.energy_metric import read_relations
 from evaluation.metrics.metric_registry import build_metrics
 from evaluation.metrics.scorecard import Scorecard

@@ -13,8 +13,7 @@ import numpy as np
 from evaluation.metrics.exm import DEFAULT_EXM
 from evaluation.metrics.metric import Finding, Metric
 from evaluation.metrics.metric_registry import METRICS, MetricEntry
-from evaluation.metrics.run_arrays import RunArrays
-from evaluation.metrics.run_metrics import RUN_METRICS, RunData, run_data
+from evaluation.metrics.run_metrics import RUN_METRICS, RunArrays, RunData, run_data
 from ratslam.service.check_results import Result, Trial, Violation, check, find_parts, require, require_equal
 from tactile.base.se2 import integrate
 

@@ -15,11 +15,14 @@ import numpy as np
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from evaluation.artifacts.closure_table import read_closure_table
 from evaluation.artifacts.grid_files import Nav2Map, read_nav2
-from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.recorded_views import read_whisker_views
-from evaluation.artifacts.run_reader import read_columns, read_run
+from evaluation.artifacts.run_reader import (
+    read_closure_table,
+    read_columns,
+    read_manifest,
+    read_run,
+    read_whisker_views,
+)
 from evaluation.metrics.run_metrics import arrange_pieces
 from evaluation.metrics.trajectory import align
 from ratslam.runs.build_session import open_observations, read_observations

@@ -10,10 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.artifacts.closure_table import Closures, count_closures
-from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.run_reader import check_run_directory, has_steps, read_run
-from evaluation.metrics.run_arrays import RunArrays
+from evaluation.artifacts.run_reader import (
+    Closures,
+    check_run_directory,
+    count_closures,
+    has_steps,
+    read_manifest,
+    read_run,
+)
+from evaluation.metrics.run_metrics import RunArrays
 from evaluation.metrics.trajectory import ate
 from evaluation.report.verdict import CAUTION, judge_map
 from ratslam.mapping.pose_graph import read_json

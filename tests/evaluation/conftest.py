@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.metrics.run_arrays import RunArrays
+from evaluation.metrics.run_metrics import RunArrays
 from tactile.base.se2 import compose, integrate, inverse
 
 _ROOT = Path(__file__).parents[2]

@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from evaluation.artifacts import closure_table, recorded_views
+from evaluation.artifacts import run_reader
 from evaluation.artifacts.grid_files import FREE_THRESH, OCCUPIED_THRESH, read_grid, read_nav2, write_nav2
-from evaluation.artifacts.manifest import read_manifest
-from evaluation.artifacts.run_reader import read_scorecard, read_walls, write_walls
+from evaluation.artifacts.run_reader import read_manifest, read_scorecard, read_walls, write_walls
 from evaluation.metrics.occupancy_grid import PRIOR_OCCUPANCY, OccupancyGrid
 from evaluation.metrics.scorecard import score_run
 from tactile.base.errors import InputError
@@ -37,8 +36,8 @@ def test_walls_read_back_equal(tmp_path_factory, walls):
 
 def test_without_files_there_are_no_walls_closures_and_views_and_the_run_is_not_finished(tmp_path):
     assert read_walls(tmp_path).shape == (0, 5)
-    assert closure_table.read_closures(tmp_path).shape == (0, 2)
-    assert recorded_views.read_closure_views(tmp_path) is None
+    assert run_reader.read_closures(tmp_path).shape == (0, 2)
+    assert run_reader.read_closure_views(tmp_path) is None
     assert read_manifest(tmp_path).status == "running"
     (tmp_path / "manifest.json").write_text('{"recording": 3}')
     with pytest.raises(InputError, match="manifest"):
@@ -53,14 +52,14 @@ def test_malformed_walls_are_refused(tmp_path):
 
 def test_accepted_closures_are_read(tmp_path):
     (tmp_path / "closures.csv").write_text(CLOSURES)
-    assert closure_table.read_closures(tmp_path).tolist() == [[10, 30], [25, 40]]
-    table = closure_table.read_closure_table(tmp_path)
+    assert run_reader.read_closures(tmp_path).tolist() == [[10, 30], [25, 40]]
+    table = run_reader.read_closure_table(tmp_path)
     assert table.verdicts == ["accepted", "open", "accepted", "undone"]
     assert {name: values.tolist() for name, values in table.evidence.items()} == {
         "keyframe": [9, 9, 9, 9], "match": [2, 3, 4, 4], "weight": [1, 0, np.inf, 0]
     }  # fmt: skip
-    closure_table.write_closure_pairs(tmp_path / "closures.csv", np.array([[9, 2], [12, 3]]))
-    table = closure_table.read_closure_table(tmp_path)
+    run_reader.write_closure_pairs(tmp_path / "closures.csv", np.array([[9, 2], [12, 3]]))
+    table = run_reader.read_closure_table(tmp_path)
     assert (table.steps.tolist(), table.verdicts, table.evidence) == ([[2, 9], [3, 12]], ["accepted"] * 2, {})
 
 
@@ -69,7 +68,7 @@ def test_closures_of_a_continued_run_count_from_its_first_step(tmp_path):
     (tmp_path / "closures.csv").write_text(CLOSURES)
     (tmp_path / "online.tum").write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(30)))
     np.savez(tmp_path / "map.npz", steps=np.array(50))
-    assert closure_table.read_closures(tmp_path).tolist() == [[5, 20]]
+    assert run_reader.read_closures(tmp_path).tolist() == [[5, 20]]
 
 
 @pytest.mark.parametrize(
@@ -78,7 +77,7 @@ def test_closures_of_a_continued_run_count_from_its_first_step(tmp_path):
 def test_malformed_closures_are_refused(tmp_path, content):
     (tmp_path / "closures.csv").write_text(content)
     with pytest.raises(InputError, match=r"closures\.csv:2"):
-        closure_table.read_closures(tmp_path)
+        run_reader.read_closures(tmp_path)
 
 
 def test_scorecards_read_back_equal(tmp_path, circle):
@@ -92,18 +91,18 @@ def test_scorecards_read_back_equal(tmp_path, circle):
         read_scorecard(tmp_path / "elsewhere")
 
 
-CHANGE = closure_table.ChangeRow(0.1, 0.2, 0.15, "new", 240.5, 1e-12, 7, 76, 402)
+CHANGE = run_reader.ChangeRow(0.1, 0.2, 0.15, "new", 240.5, 1e-12, 7, 76, 402)
 
 
 @pytest.mark.parametrize("rows", [[], [CHANGE, CHANGE._replace(kind="gone", evidence=50.25)]])
 def test_changes_read_back_equal_and_a_malformed_line_is_named(rows, tmp_path):
-    closure_table.write_changes(tmp_path / closure_table.CHANGES, rows)
-    assert closure_table.read_changes(tmp_path / closure_table.CHANGES) == rows
-    content = (tmp_path / closure_table.CHANGES).read_text()
+    run_reader.write_changes(tmp_path / run_reader.CHANGES, rows)
+    assert run_reader.read_changes(tmp_path / run_reader.CHANGES) == rows
+    content = (tmp_path / run_reader.CHANGES).read_text()
     for line in ("1,2", "a,0.2,0.15,new,240.5,0,7,76,402", "nan,0.2,0.15,new,240.5,0,7,76,402"):
-        (tmp_path / closure_table.CHANGES).write_text(f"{content}{line}\n")
-        with pytest.raises(InputError, match=f"{closure_table.CHANGES}:{2 + len(rows)}"):
-            closure_table.read_changes(tmp_path / closure_table.CHANGES)
+        (tmp_path / run_reader.CHANGES).write_text(f"{content}{line}\n")
+        with pytest.raises(InputError, match=f"{run_reader.CHANGES}:{2 + len(rows)}"):
+            run_reader.read_changes(tmp_path / run_reader.CHANGES)
 
 
 def test_a_change_is_described_with_place_and_steps():
@@ -111,19 +110,19 @@ def test_a_change_is_described_with_place_and_steps():
 
 
 def test_closure_views_read_back_equal(tmp_path):
-    image = recorded_views.eight_bit(np.array([[[0.0, 1.0], [1e-6, 0.0]], [[1.0, 0.0], [0.5, 0.0]]]))
+    image = run_reader.eight_bit(np.array([[[0.0, 1.0], [1e-6, 0.0]], [[1.0, 0.0], [0.5, 0.0]]]))
     assert image.tolist() == [[0, 1], [255, 128]]
-    views = recorded_views.ClosureViews(np.array([4]), image[None])
-    recorded_views.write_closure_views(tmp_path / recorded_views.NAME, views)
-    again = recorded_views.read_closure_views(tmp_path)
+    views = run_reader.ClosureViews(np.array([4]), image[None])
+    run_reader.write_closure_views(tmp_path / run_reader.CLOSURE_VIEWS, views)
+    again = run_reader.read_closure_views(tmp_path)
     assert again is not None
     assert [np.array_equal(*pair) for pair in zip(views, again, strict=True)] == [True, True]
-    np.savez(tmp_path / recorded_views.NAME, step=np.arange(2), view=image[None])
+    np.savez(tmp_path / run_reader.CLOSURE_VIEWS, step=np.arange(2), view=image[None])
     with pytest.raises(InputError, match=r"closure_views\.npz"):
-        recorded_views.read_closure_views(tmp_path)
+        run_reader.read_closure_views(tmp_path)
 
 
-VIEWS = recorded_views.WhiskerViews(
+VIEWS = run_reader.WhiskerViews(
     np.zeros((4, 3, 6)), np.arange(72).reshape(4, 3, 6) % 7 > 0, np.arange(6) * np.pi / 3,
     np.array([0.05, 0.11, 0.16]), 0.05,
 )  # fmt: skip
@@ -133,9 +132,9 @@ VIEWS = recorded_views.WhiskerViews(
 def test_whisker_images_read_back_within_one_grey_level_with_equal_bytes(tmp_path_factory, view):
     folder = tmp_path_factory.mktemp("images")
     for name in ("a", "b"):
-        recorded_views.write_whisker_views(folder / name, VIEWS._replace(view=view))
+        run_reader.write_whisker_views(folder / name, VIEWS._replace(view=view))
     assert (folder / "a").read_bytes() == (folder / "b").read_bytes()
-    found = recorded_views.read_whisker_views(folder / "a")
+    found = run_reader.read_whisker_views(folder / "a")
     assert np.abs(found.view - view).max() <= 1 / 255
     assert np.array_equal(found.view > 0, view > 0)
     for written, read in zip(VIEWS[1:], found[1:], strict=True):
@@ -160,7 +159,7 @@ def test_a_grid_file_keeps_every_digit(tmp_path_factory, probability, x, cell):
     ("read", "whole", "odd"),
     [
         (read_grid, GRID, {"probability": np.full((2, 2), 7.0)}),
-        (recorded_views.read_whisker_views, VIEWS, {"length": np.zeros(2)}),
+        (run_reader.read_whisker_views, VIEWS, {"length": np.zeros(2)}),
     ],
 )
 def test_spoilt_and_foreign_archives_are_refused(tmp_path, read, whole, odd):

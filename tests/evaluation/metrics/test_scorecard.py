@@ -15,11 +15,10 @@ from evaluation.metrics.energy_metric import Relations
 from evaluation.metrics.exm import ExmConfig
 from evaluation.metrics.metric import Finding, Metric
 from evaluation.metrics.metric_registry import METRICS, MetricEntry, build_metrics
-from evaluation.metrics.run_arrays import RunArrays
-from evaluation.metrics.run_metrics import PIECES, arrange_pieces, ate_within_pieces
+from evaluation.metrics.run_metrics import PIECES, Layers, RunArrays, arrange_pieces, ate_within_pieces
 from evaluation.metrics.scorecard import Scorecard, render_scorecard, score_log, score_run
 from evaluation.metrics.trajectory import ate, write_tum
-from evaluation.plots.map_plot import Layers, draw_changes, draw_map, map_headline
+from evaluation.plots.map_plot import draw_changes, draw_map, map_headline
 from evaluation.report.verdict import describe_score
 from ratslam.core.estimates import Localisation, pieces_of, write_course
 from tactile.base.errors import InputError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PatchCollection
 
-from evaluation.artifacts.recorded_views import WhiskerViews
+from evaluation.artifacts.run_reader import WhiskerViews
 from evaluation.cells.rate_map import arena_edges, bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
 from evaluation.metrics.exm import experience_metric

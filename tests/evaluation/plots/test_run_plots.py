@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.artifacts.recorded_views import read_whisker_views
-from evaluation.artifacts.run_reader import read_walls
+from evaluation.artifacts.run_reader import read_walls, read_whisker_views
 from evaluation.plots.run_plots import plot_writers
 from ratslam.cli import main
 from ratslam.runs.build_session import open_source

@@ -15,11 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from evaluation.artifacts.closure_table import ClosureTable, read_closure_table
-from evaluation.artifacts.recorded_views import ClosureViews
-from evaluation.metrics.run_arrays import NOT_JUDGED, UNFINISHED
+from evaluation.artifacts.run_reader import ClosureTable, ClosureViews, read_closure_table
+from evaluation.metrics.run_metrics import NOT_JUDGED, UNFINISHED, Layers
 from evaluation.metrics.scorecard import score_run
-from evaluation.plots.map_plot import Layers
 from evaluation.report.charts import overlay_chart
 from evaluation.report.page import content_policy, embedded_json
 from evaluation.report.run_report import VIEW_BYTES, closure_records, halve, view_records

@@ -18,8 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.artifacts.manifest import RUNNING, SESSION_REPORT
-from evaluation.artifacts.run_reader import read_run, read_walls
+from evaluation.artifacts.run_reader import RUNNING, SESSION_REPORT, read_run, read_walls
 from evaluation.monitor import RunMonitor, RunProgress, draw_watch, watch_run
 from ratslam.cli import main
 from ratslam.cli.live import monitor

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.artifacts.closure_table import read_closure_table
-from evaluation.artifacts.recorded_views import read_closure_views
+from evaluation.artifacts.run_reader import read_closure_table, read_closure_views
 from evaluation.report.run_report import view_records
 from ratslam.cli import main
 from ratslam.runs.map_results import write_report

@@ -15,10 +15,14 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from evaluation.artifacts.closure_table import read_closure_table
 from evaluation.artifacts.grid_files import read_nav2, write_nav2
-from evaluation.artifacts.recorded_views import WhiskerViews, write_whisker_views
-from evaluation.artifacts.run_reader import read_run, write_pieces
+from evaluation.artifacts.run_reader import (
+    WhiskerViews,
+    read_closure_table,
+    read_run,
+    write_pieces,
+    write_whisker_views,
+)
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.trajectory import align, read_tum, write_tum
 from ratslam.service.export_formats import export_run

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from evaluation.artifacts.closure_table import read_closure_table
-from evaluation.artifacts.run_reader import read_run
+from evaluation.artifacts.run_reader import read_closure_table, read_run
 from ratslam.cli import main
 from ratslam.core.estimates import GridDrawing
 from ratslam.runs.run import run
