@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
-SECONDS, MEMORY = 60.0, 2 << 30
+SECONDS, MEMORY = 200.0, 2 << 30
 """Most time and memory (s, bytes) until a command has refused its input or made its first step."""
 LONG = 25.0
 """A run that made steps is interrupted after this time, s."""
