@@ -251,7 +251,7 @@ def change_folder(folder: Path, what: str, last: str, change: Callable[[Path], N
         before = [file for file in folder.iterdir() if not file.name.startswith(".")]
         for file in before:
             (shown / file.name).symlink_to(file)
-        with _errors_of(folder, shown):
+        with _errors_of_shown(folder, shown):
             change(shown)
         removed = [file.name for file in before if not os.path.lexists(shown / file.name)]
         for file in shown.iterdir():
@@ -333,7 +333,7 @@ def _put_in_place(folder: Path) -> None:
 
 
 @contextmanager
-def _errors_of(folder: Path, shown: Path) -> Iterator[None]:
+def _errors_of_shown(folder: Path, shown: Path) -> Iterator[None]:
     """Names the files of `folder` in errors instead of those that show them."""
     try:
         yield
