@@ -32,9 +32,9 @@ from ratslam.mapping.config import FULL, Ablation
 from ratslam.runs.settings.packaged import find_config
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import Document, load, open_path, override, validate
-from ratslam.runs.settings.yaml_document import KeyPath, Place
+from ratslam.runs.settings.yaml_document import Place
 from tactile.base.errors import InputError, InputErrors, did_you_mean
-from tactile.base.settings import Settings
+from tactile.base.settings import KeyPath, Settings
 
 
 def _quantity_name(name: str, *, directed: bool = False) -> str:

@@ -17,9 +17,8 @@ from ratslam.methods.method_registry import BACKENDS, LOCALISING
 from ratslam.runs.build_session import build_session
 from ratslam.runs.estimate import START, PoseEstimate
 from ratslam.runs.map_settings import Sensor, check_same_settings
-from ratslam.runs.settings.renamed_keys import with_moved_settings
 from ratslam.runs.settings.run_config import LoopConfig, RunConfig
-from ratslam.runs.settings.strict_yaml import MAP, dump, kind_of, parse, validate
+from ratslam.runs.settings.strict_yaml import MAP, dump, kind_of, parse, validate, with_moved_settings
 from robot.sources.source import Source, SourceDescription, describe
 from robot.touch_source import TouchSource
 from tactile.base.bounded import NPZ_SPOILT, malformed, reason

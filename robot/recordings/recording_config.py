@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from pathlib import Path
 from typing import Self
 
@@ -11,6 +12,7 @@ from robot.recordings.input_judge import DEFAULT_LIMITS, UnitLimits
 from robot.recordings.sanity_checks import StretchConfig
 from robot.recordings.video import ImageViewConfig, VideoConfig, VisualOdometryConfig
 from robot.sources.odometry import UNCORRECTED, OdometryCorrection
+from tactile.base.settings import KeyPath
 
 
 class RecordingConfig(StretchConfig):
@@ -34,28 +36,30 @@ class RecordingConfig(StretchConfig):
     limits: UnitLimits = DEFAULT_LIMITS
     """Limits of the unit check, beyond which a recording is refused."""
 
-    def resolved(self, folder: Path) -> Self:
-        """A copy with absolute paths; relative ones start at `folder`.
+    def resolved(self, folder: Path, here: Container[KeyPath] = (), at: KeyPath = ()) -> Self:
+        """See `Settings.resolved`.
 
         One `*` in the file name of a part of the table or of the video stands for the beginning of the
         recording's file name: beside `aces_odom_gt.csv`, `*_scans.csv` is `aces_scans.csv`.
         """
-        recording = folder / self.file
+        found = super().resolved(folder, here, at)
         parts = {
-            key: part.model_copy(update={"file": _companion(recording, folder, part.file)})
+            key: getattr(found.table, key).model_copy(update={"file": _companion(found.file, part.file)})
             for key in ("views", "contacts", "labels", "pairs", "truth")
-            if (part := getattr(self.table, key)) is not None and part.file is not None
+            if (part := getattr(self.table, key)) is not None and _names_companion(part.file)
         }
-        given = [key for key in ("stamps", "odometry") if getattr(self.video, key) is not None]
-        beside = {key: _companion(recording, folder, getattr(self.video, key)) for key in given}
-        table, video = self.table.model_copy(update=parts), self.video.model_copy(update=beside)
-        return self.model_copy(update={"file": recording, "table": table, "video": video})
+        given = {key: getattr(self.video, key) for key in ("stamps", "odometry")}
+        beside = {key: _companion(found.file, file) for key, file in given.items() if _names_companion(file)}
+        table, video = found.table.model_copy(update=parts), found.video.model_copy(update=beside)
+        return found.model_copy(update={"table": table, "video": video})
 
 
-def _companion(recording: Path, folder: Path, file: Path) -> Path:
-    """The path of a part of the table: in `folder`, or beside the recording if its name has a `*`."""
-    if file.name.count("*") != 1:
-        return folder / file
+def _names_companion(file: Path | None) -> bool:
+    return file is not None and file.name.count("*") == 1
+
+
+def _companion(recording: Path, file: Path) -> Path:
+    """The file beside a recording whose name has a `*` for the beginning of the recording's name."""
     before, after = file.name.split("*")
     beside = recording.parent / file.parent
     star = slice(len(before), -len(after) or None)

@@ -10,10 +10,11 @@ from typing import Any
 
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import open_path, validate
-from ratslam.runs.settings.yaml_document import Document, KeyPath, Place
+from ratslam.runs.settings.yaml_document import Document, Place
 from robot.recordings.video import SUFFIXES as VIDEO_SUFFIXES
 from robot.sources.input_files import raise_errors, read_bytes
 from tactile.base.errors import InputError
+from tactile.base.settings import KeyPath
 
 Value = float | int | bool | str | None
 

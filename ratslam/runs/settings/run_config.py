@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,9 +15,8 @@ from evaluation.metrics.metric_registry import METRICS
 from ratslam.classic.config import CellsConfig
 from ratslam.methods.config import ClassicBackendConfig, GridBackendConfig, LocaliseBackendConfig
 from ratslam.runs.settings.packaged import PresetName, find_config
-from ratslam.runs.settings.renamed_keys import with_moved_settings
-from ratslam.runs.settings.strict_yaml import load, merge_includes, validate
-from ratslam.runs.settings.yaml_document import Document, KeyPath
+from ratslam.runs.settings.strict_yaml import load, read_configuration, validate, with_moved_settings
+from ratslam.runs.settings.yaml_document import Document
 from robot.live.live_config import LiveConfig
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.create.simulated_session import CreateSimulationConfig
@@ -27,7 +26,7 @@ from robot.sources.source import SOURCES
 from robot.touch_source import TOUCH
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.plugins import PluginConfig, Registry, read_settings
-from tactile.base.settings import Settings
+from tactile.base.settings import KeyPath, Settings
 from tactile.frontend import TouchConfig
 
 
@@ -110,17 +109,17 @@ class RunConfig(LocaliseBackendConfig, ClassicBackendConfig, GridBackendConfig, 
     cells: CellsConfig | None = None
     """Recording of the pose cells to `cells.npz`, for methods that have them; null: none."""
 
-    def with_absolute_paths(self, folder: Path) -> RunConfig:
-        """The configuration with relative paths taken from `folder`, independent of the working folder."""
-        found = self.resolved(folder)  # all but the settings of plugins
-        parts = {name: getattr(found, name) for name in SOURCE_SECTIONS}
-        parts["source"] = self.source and _resolved_plugin(self.source, SOURCES, folder)
-        frontend = self.touch.frontend and _resolved_plugin(self.touch.frontend, TOUCH, folder)
-        touch = {"reports": found.touch.reports, "frontend": frontend}
-        parts["touch"] = self.touch.model_copy(update=touch)
-        parts["localise"] = self.localise.model_copy(update={"map": found.localise.map})
-        parts["score"] = self.score.model_copy(update={"relations": found.score.relations})
-        return self.model_copy(update=parts)
+    def with_absolute_paths(self, folder: Path, here: Container[KeyPath] = ()) -> RunConfig:
+        """The configuration with relative paths taken from `folder`, and those whose keys are in `here` from
+        the working folder."""
+        found = self.resolved(folder, here)  # all but the settings of plugins
+        source, touch = self.source, found.touch
+        if source:
+            source = _resolved_plugin(source, SOURCES, folder, here, ("source",))
+        if touch.frontend:
+            frontend = _resolved_plugin(touch.frontend, TOUCH, folder, here, ("touch", "frontend"))
+            touch = touch.model_copy(update={"frontend": frontend})
+        return found.model_copy(update={"source": source, "touch": touch})
 
 
 class LoopConfig(RunConfig):
@@ -144,20 +143,12 @@ def load_config(
         InputErrors: all errors in it, each with file, line and column.
     """
     path, model = find_config(path), RunConfig if source_required else LoopConfig
-    document = merge_includes(with_moved_settings(load(path, assignments)), path.parent)
+    document = read_configuration(path, assignments)
     _check_sources(document, assignments)
     config = validate(document, model)
     _check_plugins(document, config)
-    here = config.with_absolute_paths(Path.cwd())
-    for keys in [keys for keys, place in document.places.items() if place.value.startswith("--set")]:
-        text: Any = document.value(keys)
-        value: Any = here
-        if isinstance(text, str):
-            for key in keys:
-                value = getattr(value, str(key)) if isinstance(value, Settings) else value[key]
-            if str(value) != text:  # a relative path
-                document.value(keys[:-1])[keys[-1]] = str(value)
-    return validate(document, model).with_absolute_paths(path.parent.resolve())
+    here = {keys for keys, place in document.places.items() if place.value.startswith("--set")}
+    return config.with_absolute_paths(path.parent.resolve(), here)
 
 
 def _check_sources(document: Document, assignments: Sequence[str]) -> None:
@@ -209,12 +200,13 @@ def _check_plugins(document: Document, config: RunConfig) -> None:
         raise InputErrors(errors)
 
 
-def _resolved_plugin(config: PluginConfig, registry: Registry[Any], folder: Path) -> PluginConfig:
-    """The configuration of a part with the relative paths in its settings taken from `folder`."""
+def _resolved_plugin(
+    config: PluginConfig, registry: Registry[Any], folder: Path, here: Container[KeyPath], at: KeyPath
+) -> PluginConfig:
+    """The configuration of a part with the paths in its settings made absolute, see `Settings.resolved`."""
     model = registry.get(config.plugin, "plugin").config_class
-    settings = read_settings(model, config.settings, "settings")
-    paths = {name: folder / value for name, value in settings if isinstance(value, Path)}
-    given: dict[str, Any] = json.loads(settings.model_copy(update=paths).model_dump_json(exclude_unset=True))
+    settings = read_settings(model, config.settings, "settings").resolved(folder, here, (*at, "settings"))
+    given: dict[str, Any] = json.loads(settings.model_dump_json(exclude_unset=True))
     return config.model_copy(update={"settings": given})
 
 

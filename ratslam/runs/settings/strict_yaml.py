@@ -1,8 +1,9 @@
 """Configuration files: YAML read strictly, validated in one pass, written back exactly.
 
-`load` reads a file, `override` applies `--set`, `merge_includes` adds the files of settings that it includes
-(such as the rig that `fit` writes), `validate` makes a model of it, and `dump` is its inverse. Errors of
-pydantic become messages with file, line and column. `kind_of` tells other files from configurations.
+`load` reads a file, `override` applies `--set`, `validate` makes a model of a document, and `dump` is its
+inverse. `read_configuration` also gives moved settings their new names and adds the files that a
+configuration includes, such as the rig that `fit` writes. Errors of pydantic become messages with file, line
+and column. `kind_of` tells other files from configurations.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ from pydantic_core import ErrorDetails
 from ratslam.runs.settings.yaml_document import (
     Document,
     Dumper,
-    KeyPath,
     Place,
     Reader,
     describe,
@@ -35,7 +35,7 @@ from ratslam.runs.settings.yaml_document import (
 )
 from robot.recordings.video import SUFFIXES as VIDEOS
 from tactile.base.errors import InputError, InputErrors
-from tactile.base.settings import Settings
+from tactile.base.settings import KeyPath, Settings
 
 _MAX_ERRORS = 50
 _WORDS = {
@@ -411,10 +411,59 @@ def _escape(data: Any) -> Any:
             return data
 
 
-KEY = "include"
+def read_configuration(path: Path, assignments: Sequence[str] = ()) -> Document:
+    """The document of a configuration file with its moved settings and those of the files that it includes.
+
+    Args:
+        assignments: as for `load`.
+
+    Raises:
+        InputError: a file cannot be read or is not strict YAML; with file, line and column.
+    """
+    return _merge_includes(with_moved_settings(load(path, assignments)), path.parent)
 
 
-def merge_includes(document: Document, folder: Path) -> Document:
+TO_ATTRACTOR = (
+    "excite_width", "excite_sigma", "inhibit_width", "inhibit_sigma", "global_inhibition", "settle_steps",
+    "engine",
+)  # fmt: skip
+LEFT_RECALL = ("mode_decay", "miss_weight", "reach", "reach_heading", "modes", "energy")
+MOVED: dict[str, str | None] = {
+    **{f"pose_cells.{name}": f"attractor.{name}" for name in TO_ATTRACTOR},
+    **dict.fromkeys(f"recall.{name}" for name in LEFT_RECALL),
+}
+"""Old dotted path of a setting to the new one; None: the pose cells have no such setting."""
+
+
+def with_moved_settings(document: Document) -> Document:
+    """A configuration with the settings of `MOVED` under their new names, at the places of the old ones.
+
+    A value that stands under the new name stays. Settings without a new name are left out of what the program
+    wrote, which has all of them; a user's own are unknown keys.
+    """
+    data, places = copy.deepcopy(document.data), dict(document.places)
+    paths: dict[KeyPath, KeyPath | None] = {
+        tuple(old.split(".")): None if new is None else tuple(new.split(".")) for old, new in MOVED.items()
+    }
+    written = all(old in places for old, new in paths.items() if new is None)
+    for old, new in paths.items():
+        if old not in places or (new is None and not written):
+            continue
+        section = {} if new is None else data.setdefault(str(new[0]), {})
+        if not isinstance(section, dict):
+            continue
+        value, place = data[str(old[0])].pop(old[1]), places.pop(old)
+        if new is not None:
+            section.setdefault(new[1], value)
+            places.setdefault(new[:1], place)
+            places.setdefault(new, place)
+    return Document(data, places)
+
+
+INCLUDE = "include"
+
+
+def _merge_includes(document: Document, folder: Path) -> Document:
     """The document with the settings of the files that it includes, for those that it leaves open.
 
     A value of the document comes before one of its files, and a later file before an earlier one. Sections
@@ -426,18 +475,20 @@ def merge_includes(document: Document, folder: Path) -> Document:
     Raises:
         InputError: a file cannot be read, is not strict YAML, or includes others.
     """
-    names = document.data.get(KEY)
+    names = document.data.get(INCLUDE)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return document  # nothing, or an error that validation reports
-    merged = Document({**document.data, KEY: []}, document.places)
-    folder = Path() if document.places[KEY,].value.startswith("--set") else folder
+    merged = Document({**document.data, INCLUDE: []}, document.places)
+    folder = Path() if document.places[INCLUDE,].value.startswith("--set") else folder
     for name in reversed(names):
         if not (folder / name).is_file():
-            where, cure = document.at_key((KEY,)), f"paths start at {folder.resolve()}"
+            where, cure = document.at_key((INCLUDE,)), f"paths start at {folder.resolve()}"
             raise InputError(where, f"no file {folder / name}", "an existing file", cure)
         below = load(folder / name)
-        if KEY in below.data:
-            raise InputError(below.at_key((KEY,)), "files that an included file includes", "settings only")
+        if INCLUDE in below.data:
+            raise InputError(
+                below.at_key((INCLUDE,)), "files that an included file includes", "settings only"
+            )
         places: dict[KeyPath, Place] = {**below.places, **merged.places}
         merged = Document(merge_settings(below.data, merged.data), places)
     return merged

@@ -18,9 +18,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from tactile.base.errors import InputError, InputErrors
-
-KeyPath = tuple[str | int, ...]
-"""The keys (and list indices) that lead from the top to a value."""
+from tactile.base.settings import KeyPath
 
 
 class Place(NamedTuple):

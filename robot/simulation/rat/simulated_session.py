@@ -6,7 +6,7 @@ Its random walk has Ornstein-Uhlenbeck speed and turning and is drawn to the wal
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from functools import partial
 from math import atan2, cos, exp, pi, sin
 from pathlib import Path
@@ -40,7 +40,7 @@ from tactile.base.bounded import read_npz
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, wrap
-from tactile.base.settings import Settings
+from tactile.base.settings import KeyPath, Settings
 from tactile.base.types import Observation, observation
 
 CELLS, ROOM = 21, 1.05
@@ -73,11 +73,9 @@ class PathFileConfig(MotionConfig):
     skip: NonNegativeFloat = 0.0
     """Time to leave out at the beginning, s."""
 
-    def resolved(self, folder: Path) -> Self:
-        """A copy whose file, unless packaged, is taken from the folder."""
-        if str(self.file) in PACKAGED:
-            return self
-        return self.model_copy(update={"file": folder / self.file})
+    def resolved(self, folder: Path, here: Container[KeyPath] = (), at: KeyPath = ()) -> Self:
+        """See `Settings.resolved`; the name of a packaged path stays."""
+        return self if str(self.file) in PACKAGED else super().resolved(folder, here, at)
 
 
 def read_path(config: PathFileConfig) -> RatPath:

@@ -15,9 +15,8 @@ from evaluation.studies.study import read_study
 from ratslam.cli import main
 from ratslam.runs.map_settings import differing_settings, flat_settings
 from ratslam.runs.settings.packaged import find_config, packaged_configs, read_citation
-from ratslam.runs.settings.renamed_keys import MOVED
 from ratslam.runs.settings.run_config import RunConfig, changed_settings, load_config
-from ratslam.runs.settings.strict_yaml import dump, load, parse, validate
+from ratslam.runs.settings.strict_yaml import MOVED, dump, load, parse, validate
 from tactile.base.errors import InputError, InputErrors
 
 ROOT = Path(__file__).parents[4]
