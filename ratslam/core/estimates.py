@@ -97,6 +97,22 @@ class Localisation(IntEnum):
     """Most views match no keyframe: the session is most likely not in this map, or in a part that was never
     driven."""
 
+    def after(self, *, found: bool, lost: bool, likely: bool, unexplained: bool) -> Localisation:
+        """The state after the poses that the robot may have were judged once more, in maps of all methods.
+
+        Args:
+            found: one is likely enough, and likelier than any other by far. lost: the known one is so no
+                longer. likely: one has half the evidence of a known one. unexplained: in this map one would
+                have been found by now.
+        """
+        if found:
+            return Localisation.FOUND
+        if self == Localisation.FOUND:
+            return Localisation.LOST if lost else self
+        if likely:
+            return Localisation.SEARCHING if self == Localisation.NOT_THIS_MAP else self
+        return Localisation.NOT_THIS_MAP if unexplained else self
+
 
 class LocalisedPose(NamedTuple):
     """The pose of a session in a finished map at one step.

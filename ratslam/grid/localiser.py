@@ -87,21 +87,17 @@ class GridLocaliser(LocalisedMap):
 
     def _judge(self, share: float, odds: float, failed: bool) -> None:
         """Finds, keeps or loses the pose."""
-        known = self._state == Localisation.FOUND
-        if failed:
-            self._failed += 1
-            if known:
-                self._state, self._failed = int(Localisation.LOST), 0
-            elif self._failed >= UNEXPLAINED:
-                self._state = int(Localisation.NOT_THIS_MAP)
-        elif odds >= self._needed and share >= _chance(self._needed / 2):
-            self._state, self._failed = int(Localisation.FOUND), 0
-        elif known and share < LEAST_SHARE:
-            self._state = int(Localisation.LOST)
-        elif odds >= self._needed / 2:
+        before, likely = Localisation(self._state), not failed and odds >= self._needed / 2
+        self._failed = self._failed + 1 if failed else 0 if likely else self._failed
+        now = before.after(
+            found=not failed and odds >= self._needed and share >= _chance(self._needed / 2),
+            lost=failed or share < LEAST_SHARE,
+            likely=likely,
+            unexplained=failed and self._failed >= UNEXPLAINED,
+        )
+        if before == Localisation.FOUND and now != before:
             self._failed = 0
-            if self._state == Localisation.NOT_THIS_MAP:
-                self._state = int(Localisation.SEARCHING)
+        self._state = int(now)
 
 
 def _chance(log_odds: float) -> float:

@@ -192,44 +192,34 @@ class Localiser(LocalisedMap):
 
     def _update_state(self, moved: Motion) -> None:
         """Finds, keeps or loses the pose."""
-        known = self._hypotheses
-        if not known.count:
-            self._newest, self._covariance = PoseHypothesis(self._newest, self._covariance).moved(moved)
-            self._mass, self._log_odds = 0.0, -self._places
-            self._update_unknown(0.0)
-            return
-        order = known.ranked()
-        best, odds = int(order[0]), known.log_odds.rows
-        others = np.logaddexp.reduce([*odds[order[1:]], self._needed])
-        self._newest, self._covariance = known.pose.rows[best].copy(), known.covariance.rows[best].copy()
-        self._mass = float(1 / (1 + np.exp(np.minimum(others - odds[best], LARGEST_EXPONENT))))
-        self._log_odds = float(odds[best] - self._places)
-        rival = odds[order[1]] if known.count > 1 else -np.inf
-        fell = known.fall(best) > self._needed
-        if not fell and not known.at(best).is_comparable(self.place.ground):
-            if self._state == Localisation.FOUND:
-                self._state = int(Localisation.LOST)
-        elif odds[best] >= self._needed and odds[best] - rival >= self._needed / 2 and not fell:
-            self._state = int(Localisation.FOUND)
-        elif self._state != Localisation.FOUND:
-            self._update_unknown(float(odds[best]))
-        elif fell:
-            self._lose()
-
-    def _update_unknown(self, best: float) -> None:
-        """The state while no pose is found, and the best hypothesis has these log-odds."""
-        if self._state == Localisation.FOUND:
-            self._lose()
+        known, needed = self._hypotheses, self._needed
+        order, odds = known.ranked(), known.log_odds.rows
+        now, best, ahead = PoseHypothesis(self._newest, self._covariance).moved(moved), 0.0, 0.0
+        self._mass, self._log_odds = 0.0, -self._places
+        fell, uncertain = True, False
+        if known.count:
+            now, best = PoseHypothesis(*map(np.copy, known.at(order[0]))), float(odds[order[0]])
+            others = np.logaddexp.reduce([*odds[order[1:]], needed])
+            self._mass = float(1 / (1 + np.exp(np.minimum(others - best, LARGEST_EXPONENT))))
+            self._log_odds = best - self._places
+            ahead = best - (odds[order[1]] if known.count > 1 else -np.inf)
+            fell = known.fall(order[0]) > needed
+            uncertain = not fell and not now.is_comparable(self.place.ground)
+        self._newest, self._covariance = now
         possible = int(self._views.shows.rows.sum()) * self.place.odds.expected
-        if best >= self._needed / 2:
-            if self._state == Localisation.NOT_THIS_MAP:
-                self._state = int(Localisation.SEARCHING)
-        elif possible >= UNEXPLAINED * self._needed:
-            self._state = int(Localisation.NOT_THIS_MAP)
+        state = Localisation(self._state)
+        after = state.after(
+            found=best >= needed and ahead >= needed / 2 and not fell and not uncertain,
+            lost=fell or uncertain,
+            likely=best >= needed / 2 and not uncertain,
+            unexplained=possible >= UNEXPLAINED * needed and not uncertain,
+        )
+        if fell and state == Localisation.FOUND:
+            self._forget()
+        self._state = int(after)
 
-    def _lose(self) -> None:
-        """The pose is lost: the search begins anew, with the views from now on."""
-        self._state = int(Localisation.LOST)
+    def _forget(self) -> None:
+        """The search begins anew, with the views from now on."""
         self._mass, self._log_odds = 0.0, -self._places
         self._found.rows[-UNCERTAIN:] = np.nan
         self._hypotheses.clear()
