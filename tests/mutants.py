@@ -18,7 +18,6 @@ import ast
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -191,9 +190,7 @@ def find(mutant: Mutant, root: Path) -> str:
         return "no test"
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "tree"
-        shutil.copytree(
-            root, copy, ignore=shutil.ignore_patterns(".git", ".venv", "runs", ".*_cache", "build")
-        )
+        subprocess.run(["git", "clone", "--quiet", root, copy], check=True)
         (copy / mutant.file).write_text(text, encoding="utf-8")
         options = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "--tb=line"]
         listed = copy / "selected.txt"
