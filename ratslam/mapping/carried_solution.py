@@ -16,15 +16,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.compiled import compiled
+from ratslam.core.compiled import compiled, wrapped
 from ratslam.mapping.closure_selection import CUT, MapHypotheses, Selection, SelectionProblem
-from ratslam.mapping.ground import BINS, GainOdds, learn_gain_odds
+from ratslam.mapping.ground import (
+    EVEN,
+    LEAVING,
+    REACH,
+    REACH_HEADING,
+    GainOdds,
+    Ground,
+    compare_view,
+    follow_track,
+    learn_gain_odds,
+    move_pose,
+)
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 from ratslam.mapping.map_solution import selected_map, selection_problem, sequences_to_select
 from ratslam.mapping.map_state import MapState
 from ratslam.mapping.optimizer import MapFit, MapProblem, System
-from ratslam.mapping.pose_tracks import SelfTraverse, Track
 from ratslam.mapping.verification import turn_on_spot
+from tactile.base.se2 import inverse
 
 ROUNDS = 3
 """Number of times that the robot is retraced."""
@@ -202,8 +213,6 @@ ALIKE = 4
 """Number of alike places for each stretch."""
 ELSEWHERE = 2.0
 """Least distance of another place, as a multiple of the reach of a keyframe."""
-EVEN = GainOdds(np.arange(BINS - 1.0), np.zeros(BINS), 0.0)
-"""Odds that say nothing."""
 
 
 def view_fits(state: MapState) -> np.ndarray:
@@ -332,3 +341,146 @@ def _best_sequence(
         chosen[k - 1] = before[k, chosen[k]]
         jumps[k] = jumped[k, chosen[k]]
     return chosen, jumps, score[chosen[-1]]
+
+
+LOST = -25.0
+"""Log-odds of the newest views below which a track ends."""
+CLIPPED = 20.0
+"""Largest absolute log-odds of one view when many poses are compared at once, nat."""
+
+
+Track = tuple[np.ndarray, np.ndarray]
+"""Poses [N, 3], and log-odds [N] of each keyframe: NaN and -inf where the track does not lead."""
+
+
+class SelfTraverse(NamedTuple):
+    """A session of N keyframes over its own map: they are ground and session.
+
+    Attributes:
+        ground: at their poses. fits: [N, S, N], see `view_fits`. motions, variances: [N - 1, 3] of the
+            odometry, without its systematic errors and without breaks.
+    """
+
+    ground: Ground
+    fits: np.ndarray
+    motions: np.ndarray
+    variances: np.ndarray
+
+    @classmethod
+    def of_map(cls, state: MapState, fit: MapFit, fits: np.ndarray) -> SelfTraverse:
+        """The keyframes of a map at the poses of a fit."""
+        motions = fit.corrected(state.odometry())
+        variances = state.odometry_variance(state.length.rows, state.turn.rows)[1:]
+        turns, reach = np.arange(fits.shape[1]) * np.pi, REACH * state.cell
+        ground = Ground(fit.poses, turns, reach, REACH_HEADING, state.closure_variance())
+        return cls(ground, fits, motions, variances)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """[N, 3] m, m, rad."""
+        return self.ground.poses
+
+    @property
+    def size(self) -> int:
+        """N."""
+        return len(self.poses)
+
+    def own_fits(self) -> np.ndarray:
+        """[N] how well each view fits at the keyframe's own pose, NaN where no keyframe is near."""
+        return np.array([self._fit(frame, pose) for frame, pose in enumerate(self.poses)])
+
+    def _fit(self, frame: int, pose: np.ndarray) -> float:
+        """How well the view of a keyframe fits at a pose [3], NaN where no keyframe is near."""
+        on = self.ground
+        return compare_view(on.poses, on.turns, self.fits[frame], pose, on.reach, on.reach_heading)[0]
+
+    def own_odds(self, odds: GainOdds) -> np.ndarray:
+        """[N] the log-odds of each view at the keyframe's own pose."""
+        fits = self.own_fits()
+        off = np.isnan(fits)
+        left = off & ~np.concatenate([[True], off[:-1]])
+        seen = odds.odds[np.searchsorted(odds.edges, np.where(off, 0.0, fits))]
+        return np.where(off, np.where(left, LEAVING, 0.0), seen)
+
+    def follow(self, frame: int, pose: np.ndarray, stop: int, odds: GainOdds) -> tuple[np.ndarray, ...]:
+        """Follows a pose [3] of a keyframe until keyframe `stop`, or until it is lost.
+
+        Returns:
+            keyframes [n], poses [n, 3], fits [n] and log-odds [n] of those that come after `frame`.
+        """
+        stop = min(max(stop, 0), self.size - 1)
+        ahead = stop >= frame
+        frames = np.arange(frame + 1, stop + 1) if ahead else np.arange(frame - 1, stop - 1, -1)
+        motions = self.motions[frames - 1] if ahead else inverse(self.motions[frames])
+        variances = self.variances[frames - 1] if ahead else self.variances[frames]
+        on = self.ground
+        _, *found = follow_track(
+            on.poses, on.turns, self.fits, frames, motions, variances, on.variance, on.reach,
+            on.reach_heading, odds.edges, odds.odds, LOST, pose,
+        )  # fmt: skip
+        return frames[: len(found[0])], *found
+
+    def track(self, first: int, poses: np.ndarray, gained: np.ndarray, extent: int, odds: GainOdds) -> Track:
+        """The track through the keyframes from number `first` on at `poses` [n, 3], where they have these
+        log-odds [n], and at most `extent` keyframes after and before them."""
+        every, of_each = track = np.full((self.size, 3), np.nan), np.full(self.size, -np.inf)
+        last = first + len(poses) - 1
+        every[first : last + 1], of_each[first : last + 1] = poses, gained
+        for end, stop in ((last, last + extent), (first, first - extent)):
+            frames, onwards, _, more = self.follow(end, every[end].copy(), stop, odds)
+            every[frames], of_each[frames] = onwards, more
+        return track
+
+    def track_from(self, frame: int, pose: np.ndarray, extent: int, odds: GainOdds) -> Track:
+        """The track through a keyframe at a pose [3]."""
+        fit = self._fit(frame, pose)
+        gained = LEAVING if np.isnan(fit) else odds.of(fit)
+        return self.track(frame, pose[None], np.array([gained]), extent, odds)
+
+    def places(self) -> np.ndarray:
+        """[C, 3] poses that a robot may have on the ground, one of each that can be told apart."""
+        on = self.ground
+        return _spread_out(on.poses, on.turns, on.reach, on.reach_heading)
+
+    def scan(self, frame: int, places: np.ndarray, length: int) -> np.ndarray:
+        """[C] how well the views of a keyframe and those after it, `length` together, fit if the keyframe
+        is at each of the places [C, 3]."""
+        on, last = self.ground, min(frame + length, self.size)
+        reach = on.reach, on.reach_heading
+        return _scan(on.poses, on.turns, self.fits, self.motions, places, frame, last, *reach)
+
+
+@compiled
+def _scan(
+    ground: np.ndarray, turns: np.ndarray, fits: np.ndarray, motions: np.ndarray, places: np.ndarray,
+    first: int, last: int, reach: float, reach_heading: float,
+) -> np.ndarray:  # fmt: skip
+    """See `SelfTraverse.scan`."""
+    total = np.zeros(len(places))
+    for k in range(len(places)):
+        pose = places[k].copy()
+        for frame in range(first, last):
+            fit = compare_view(ground, turns, fits[frame], pose, reach, reach_heading)[0]
+            total[k] += -1.0 if np.isnan(fit) else min(max(fit, -CLIPPED), CLIPPED)
+            if frame + 1 < last:
+                move_pose(pose, motions[frame])
+    return total
+
+
+@compiled
+def _spread_out(poses: np.ndarray, turns: np.ndarray, reach: float, reach_heading: float) -> np.ndarray:
+    """See `SelfTraverse.places`."""
+    kept = np.empty((len(turns) * len(poses), 3))
+    count = 0
+    for s in range(len(turns)):
+        for i in range(len(poses)):
+            angle = wrapped(poses[i, 2] + turns[s])
+            known = False
+            for k in range(count):
+                x, y = kept[k, 0] - poses[i, 0], kept[k, 1] - poses[i, 1]
+                near = x * x + y * y < reach * reach / 2
+                known = known or (near and abs(wrapped(kept[k, 2] - angle)) < reach_heading)
+            if not known:
+                kept[count, 0], kept[count, 1], kept[count, 2] = poses[i, 0], poses[i, 1], angle
+                count += 1
+    return kept[:count].copy()

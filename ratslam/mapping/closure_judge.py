@@ -25,8 +25,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
-from ratslam.core.compiled import compiled
-from ratslam.mapping.ground import MOST_REACH, MOST_REACH_HEADING, REACH, REACH_HEADING, grown_reaches
+from ratslam.core.compiled import compiled, wrapped
+from ratslam.mapping.ground import (
+    EVEN,
+    MOST_REACH,
+    MOST_REACH_HEADING,
+    REACH,
+    REACH_HEADING,
+    compare_view,
+    follow_track,
+)
 from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.map_state import MapState
 from ratslam.mapping.odometry_scan import log_ratio
@@ -208,25 +216,29 @@ def _count_views(
     """
     start = ground[way.match - begins] + [0.0, 0.0, way.turn]
     reach, turns = REACH * state.cell, np.arange(1 + state.half_turns) * np.pi
-    middle, lag = way.middle - way.low, way.low - begins
-    ahead = integrate(motion[middle + 1 :], start)
-    back = integrate(inverse(motion[middle:0:-1]), start)[::-1]
-    path = np.concatenate([back, start[None], ahead])
+    middle, lag, spread = way.middle - way.low, way.low - begins, state.closure_variance()
+    back = inverse(motion[middle:0:-1])
+    path = np.concatenate([integrate(back, start)[::-1], start[None], integrate(motion[middle + 1 :], start)])
     limits = (STRAY + MOST_REACH) * reach, MOST_REACH_HEADING * REACH_HEADING * 1.5
     frame, other, turned = _pairs(path, ground, turns, *limits, lag, state.guard)
-    fits = state.log_odds(frame + way.low, other + begins, turned > 0) - elsewhere[frame + way.low]
-    offsets = np.searchsorted(frame, np.arange(len(path) + 1))
-    near = ground, turns, offsets, other, turned, fits
-    bounds = reach, REACH_HEADING, state.closure_variance(), EDGES
-    kinds = _follow(start, middle, motion, variance, near, bounds, lag, state.guard)
+    compared, column = np.unique(other, return_inverse=True)
+    gains = np.full((len(path), len(turns), len(compared)), -np.inf)
+    gains[frame, turned, column] = (
+        state.log_odds(frame + way.low, other + begins, turned > 0) - elsewhere[frame + way.low]
+    )
+    on = ground[compared], turns, gains
+    kinds = np.empty(len(path), int)
+    stays = np.zeros((1, 3))
+    for frames, motions, variances in (
+        (np.arange(middle, len(path)), [stays, motion[middle + 1 :]], [stays, variance[middle + 1 :]]),
+        (np.arange(middle - 1, -1, -1), [back], [variance[middle:0:-1]]),
+    ):
+        way_there = frames, np.concatenate(motions), np.concatenate(variances), spread, reach, REACH_HEADING
+        pose, _, best, _ = follow_track(*on, *way_there, EVEN.edges, EVEN.odds, -np.inf, start)
+        kinds[frames] = _kinds(*on, frames, pose, best, ground, reach, lag, state.guard)
     within = np.zeros(len(path), bool)
     within[way.first - way.low : way.last + 1 - way.low] = True
     return np.stack([np.bincount(kinds[part & (kinds >= 0)], minlength=KINDS) for part in (within, ~within)])
-
-
-@compiled
-def _turned(angle: float) -> float:
-    return angle - 2 * np.pi * np.rint(angle / (2 * np.pi))
 
 
 @compiled
@@ -261,7 +273,7 @@ def _pairs(
             if apart[near] >= reach * reach or abs(g - k - lag) <= guard:
                 continue
             for s in range(len(turns)):
-                if abs(_turned(ground[g, 2] + turns[s] - path[k, 2])) < turn:
+                if abs(wrapped(ground[g, 2] + turns[s] - path[k, 2])) < turn:
                     if count == capacity:
                         more = np.empty((3, 2 * capacity), np.int64)
                         more[:, :count] = found
@@ -269,24 +281,6 @@ def _pairs(
                     found[0, count], found[1, count], found[2, count] = k, g, s
                     count += 1
     return found[0, :count].copy(), found[1, :count].copy(), found[2, :count].copy()
-
-
-_Near = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""What keyframes [W] of a way are compared with: poses [G, 3] of the ground; turns [S] by which it may be
-seen turned, rad; offsets [W + 1] of the rows [n] of the last three that belong to each keyframe of the way:
-the keyframe compared with, the number of its turn, and the gain there, nat."""
-
-
-@compiled
-def _move(pose: np.ndarray, motion: np.ndarray, onwards: bool) -> None:
-    """Moves a pose [3] by a motion, or back by it."""
-    if not onwards:
-        pose[2] -= motion[2]
-    sign = 1.0 if onwards else -1.0
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    pose[0] += sign * (c * motion[0] - s * motion[1])
-    pose[1] += sign * (s * motion[0] + c * motion[1])
-    pose[2] = _turned(pose[2] + motion[2] if onwards else pose[2])
 
 
 @compiled
@@ -301,75 +295,26 @@ def _is_apart(pose: np.ndarray, ground: np.ndarray, reach: float, frame: int, gu
 
 
 @compiled
-def _compare_view(
-    pose: np.ndarray, near: _Near, frame: int, reach: float, turn: float, on_way: tuple[float, float]
-) -> tuple[float, np.ndarray, bool]:
-    """Compares a keyframe of a way with those within `reach` (m) and `turn` (rad).
-
-    Returns:
-        the best gain, -inf without any; [3] how far the pose is from there, the mean weighted by the
-        likelihoods; whether a keyframe is within `on_way`, m and rad.
-    """
-    ground, turns, offsets, other, turned, fits = near
-    best, weight, off, met = -np.inf, 0.0, np.zeros(3), False
-    for k in range(offsets[frame], offsets[frame + 1]):
-        g = other[k]
-        x, y = ground[g, 0] - pose[0], ground[g, 1] - pose[1]
-        angle = _turned(ground[g, 2] + turns[turned[k]] - pose[2])
-        if x * x + y * y >= reach * reach or abs(angle) >= turn:
-            continue
-        if x * x + y * y < on_way[0] * on_way[0] and abs(angle) < on_way[1]:
-            met = True
-        fit = fits[k]
-        if fit > best:
-            scale = np.exp(best - fit) if weight > 0 else 0.0
-            weight, off, best = weight * scale, off * scale, fit
-        share = np.exp(fit - best)
-        weight += share
-        off += share * np.array([x, y, angle])
-    return best, off / weight if weight > 0 else off, met
-
-
-@compiled
-def _follow(
-    start: np.ndarray, middle: int, motion: np.ndarray, variance: np.ndarray, near: _Near,
-    bounds: tuple[float, float, np.ndarray, np.ndarray], lag: int, guard: int,
+def _kinds(
+    compared: np.ndarray, turns: np.ndarray, gains: np.ndarray, frames: np.ndarray, poses: np.ndarray,
+    best: np.ndarray, ground: np.ndarray, reach: float, lag: int, guard: int,
 ) -> np.ndarray:  # fmt: skip
-    """[W] kind of each view on the way, -1 for none; it is followed from its keyframe `middle`.
+    """[n] kind of each view, -1 for none.
 
     Args:
-        motion, variance: [W, 3] of the odometry into each keyframe of the way. bounds: reach, m and rad;
-            variance [3] of a closure; `EDGES`. lag: number of the first keyframe of the way, counted from
-            the first of the ground.
+        compared, turns, gains, frames: see `follow_track`. poses: [n, 3] before each view. best: [n] its best
+            gain there. lag: number of the first keyframe of the way, counted from the first of the ground.
     """
-    kinds = np.full(len(motion), -1)
-    reach, reach_heading, spread, edges = bounds
-    for onwards in (True, False):
-        # The pose with its variances of position and heading, from the claim on and back.
-        pose, place, heading = start.copy(), spread[0], spread[2]
-        frame = middle if onwards else middle - 1
-        while 0 <= frame < len(motion):
-            if frame != middle:
-                row = frame if onwards else frame + 1
-                _move(pose, motion[row], onwards)
-                place += variance[row, 0] + heading * (motion[row, 0] ** 2 + motion[row, 1] ** 2)
-                heading += variance[row, 2]
-            far, turn = grown_reaches(reach, reach_heading, place, heading)
-            best, off, on_way = _compare_view(pose, near, frame, far, turn, (reach / 2, reach_heading / 2))
-            seen = pose.copy()
-            if best > 0:  # Kalman update, position and heading apart
-                share, again = place / (place + spread[0]), heading / (heading + spread[2])
-                pose[0] += share * off[0]
-                pose[1] += share * off[1]
-                pose[2] = _turned(pose[2] + again * off[2])
-                place, heading = place * (1 - share), heading * (1 - again)
-            if on_way:
-                kinds[frame] = np.searchsorted(edges, best)
-            elif _is_apart(seen, near[0], reach, frame + lag, guard):
-                kinds[frame] = len(edges) + 2
-            elif best < edges[0] and best > -np.inf:
-                kinds[frame] = 0
-            elif best < 0:
-                kinds[frame] = len(edges) + 1
-            frame += 1 if onwards else -1
+    kinds = np.full(len(frames), -1)
+    for k in range(len(frames)):
+        frame = frames[k]
+        at_keyframe = compare_view(compared, turns, gains[frame], poses[k], reach / 2, REACH_HEADING / 2)[0]
+        if not np.isnan(at_keyframe):
+            kinds[k] = np.searchsorted(EDGES, best[k])
+        elif _is_apart(poses[k], ground, reach, frame + lag, guard):
+            kinds[k] = len(EDGES) + 2
+        elif best[k] < EDGES[0]:
+            kinds[k] = 0
+        elif np.isnan(best[k]) or best[k] < 0:
+            kinds[k] = len(EDGES) + 1
     return kinds

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
-from ratslam.core.compiled import compiled
+from ratslam.core.compiled import compiled, wrapped
 from tactile.base.se2 import compose, inverse, wrap
 
 REACH = 1.2
@@ -81,21 +81,6 @@ class Ground(NamedTuple):
         turned = np.abs(wrap(self.poses[close, 2] + self.turns[:, None] - pose[2]))
         shift, row = np.nonzero(turned < reach_heading)
         return shift, close[row]
-
-    def near_all(
-        self, poses: np.ndarray, reach: np.ndarray, reach_heading: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """`near` for poses [P, 3], each with its reaches [P].
-
-        Returns:
-            the numbers [n] of the poses, in order; the sector shifts [n] and keyframes [n].
-        """
-        x, y, heading = self.poses.T
-        apart = (x - poses[:, :1]) ** 2 + (y - poses[:, 1:2]) ** 2
-        one, frame = np.nonzero(apart < reach[:, None] ** 2)
-        turned = np.abs(wrap(heading[frame, None] + self.turns - poses[one, 2:]))
-        row, shift = np.nonzero(turned < reach_heading[one, None])
-        return one[row], shift, frame[row]
 
     def best_match(self, pose: np.ndarray, gain: np.ndarray) -> Match | None:
         """Where a view with gains [S, N or more] fits best of what a robot at `pose` [3] is compared with;
@@ -174,9 +159,13 @@ class PoseHypothesis(NamedTuple):
     def deviations(self) -> tuple[float, float]:
         """Standard deviations: of the position in the direction where it is largest, m; of the heading,
         rad."""
-        (xx, xy), (_, yy) = self.covariance[:2, :2].tolist()
-        largest = (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
-        return math.sqrt(largest), math.sqrt(self.covariance[2, 2])
+        position, heading = self.variances()
+        return math.sqrt(position), math.sqrt(heading)
+
+    def variances(self) -> tuple[Any, Any]:
+        """The squares of `deviations`, m², rad²."""
+        (xx, xy, _), (_, yy, _), (*_, heading) = np.moveaxis(self.covariance, (-2, -1), (0, 1))
+        return (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy), heading
 
 
 class Motion(NamedTuple):
@@ -211,22 +200,9 @@ def advance(
     at = at.moved(moved)
     if gain is None:
         return at, None
-    shift, frame = ground.near(at.pose, *_reaches(ground, *at.deviations()))
-    if not len(frame):
-        return at, np.nan
-    gains = gain[shift, frame].astype(float)
-    best = float(gains.max())
-    if best <= 0:
-        return at, best
-    weight = np.exp(gains - best)
-    error = ground.claims(shift, frame) - at.pose
-    error[:, 2] = wrap(error[:, 2])
-    # The Kalman filter's update by the mean of the differences.
-    share = np.linalg.solve((at.covariance + np.diag(ground.variance)).T, at.covariance.T).T
-    pose = at.pose + share @ ((weight / weight.sum()) @ error)
-    pose[2] = wrap(pose[2])
-    covariance = at.covariance - share @ at.covariance
-    return PoseHypothesis(pose, (covariance + covariance.T) / 2), best
+    reaches = grown_reaches(ground.reach, ground.reach_heading, *at.variances())
+    best, *off = compare_view(ground.poses, ground.turns, gain.astype(float), at.pose, *reaches)
+    return (_corrected(ground, at, np.array(off)) if best > 0 else at), best
 
 
 def advance_all(
@@ -235,32 +211,134 @@ def advance_all(
     """`advance` for P pose hypotheses that move alike, and the gains [P], nat. Most of many poses fit
     nowhere: only the others are corrected, one by one."""
     pose, covariance = (each.copy() for each in at.moved(moved))
-    (xx, xy, _), (_, yy, _), (*_, heading) = np.moveaxis(covariance, 0, -1)
-    position = np.sqrt((xx + yy) / 2 + np.hypot((xx - yy) / 2, xy))
-    one, shift, frame = ground.near_all(pose, *_reaches(ground, position, np.sqrt(heading)))
-    best = np.full(len(pose), np.nan)
-    near, first = np.unique(one, return_index=True)
-    if len(near):
-        best[near] = np.maximum.reduceat(gain[shift, frame].astype(float), first)
+    spread, gain = PoseHypothesis(pose, covariance).variances(), gain.astype(float)
+    best, off = _compare_at_all(
+        ground.poses, ground.turns, gain, pose, *spread, ground.reach, ground.reach_heading
+    )
     for k in np.flatnonzero(best > 0).tolist():
-        corrected, _ = advance(ground, PoseHypothesis(at.pose[k], at.covariance[k]), moved, gain)
-        pose[k], covariance[k] = corrected
+        pose[k], covariance[k] = _corrected(ground, PoseHypothesis(pose[k], covariance[k]), off[k])
     return PoseHypothesis(pose, covariance), best
+
+
+def _corrected(ground: Ground, at: PoseHypothesis, off: np.ndarray) -> PoseHypothesis:
+    """The Kalman filter's update by the mean difference [3] of the poses that a view claims."""
+    share = np.linalg.solve((at.covariance + np.diag(ground.variance)).T, at.covariance.T).T
+    pose = at.pose + share @ off
+    pose[2] = wrap(pose[2])
+    covariance = at.covariance - share @ at.covariance
+    return PoseHypothesis(pose, (covariance + covariance.T) / 2)
+
+
+LEAVING = -2.0
+"""Log-odds of leaving mapped ground: false pose hypotheses do so more often than true ones."""
+WINDOW = 15
+"""Newest views of a track by which it is known as lost."""
 
 
 @compiled
 def grown_reaches(reach: float, reach_heading: float, place: float, heading: float) -> tuple[float, float]:
     """The reaches, m and rad, of a pose with these variances of position and heading, from those of the
-    ground; for compiled loops."""
+    ground."""
     far = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
     return far, min(reach_heading + DEVIATIONS * np.sqrt(heading), MOST_REACH_HEADING * reach_heading)
 
 
-def _reaches(ground: Ground, position: Any, heading: Any) -> tuple[Any, Any]:
-    """The reaches, m and rad, of a pose with these standard deviations."""
-    reach = np.minimum(ground.reach + DEVIATIONS * position, MOST_REACH * ground.reach)
-    most = MOST_REACH_HEADING * ground.reach_heading
-    return reach, np.minimum(ground.reach_heading + DEVIATIONS * heading, most)
+@compiled
+def compare_view(
+    poses: np.ndarray, turns: np.ndarray, gain: np.ndarray, pose: np.ndarray, reach: float, turn: float
+) -> tuple[float, float, float, float]:
+    """The best gain [S, N] of a view at the keyframes within `reach` (m) and `turn` (rad) of a pose [3], NaN
+    without any, and the mean difference from it of the poses that they claim, weighted by the likelihoods
+    (m, m, rad)."""
+    best, total, dx, dy, da = -np.inf, 0.0, 0.0, 0.0, 0.0
+    for i in range(len(poses)):
+        x, y = poses[i, 0] - pose[0], poses[i, 1] - pose[1]
+        if x * x + y * y >= reach * reach:
+            continue
+        for s in range(len(turns)):
+            fit = gain[s, i]
+            if fit == -np.inf:
+                continue
+            angle = wrapped(poses[i, 2] + turns[s] - pose[2])
+            if abs(angle) >= turn:
+                continue
+            if fit > best:
+                scale = np.exp(best - fit)
+                total, dx, dy, da, best = total * scale, dx * scale, dy * scale, da * scale, fit
+            weight = np.exp(fit - best)
+            total, dx, dy, da = total + weight, dx + weight * x, dy + weight * y, da + weight * angle
+    if total == 0.0:
+        return np.nan, 0.0, 0.0, 0.0
+    return best, dx / total, dy / total, da / total
+
+
+@compiled
+def _compare_at_all(
+    poses: np.ndarray, turns: np.ndarray, gain: np.ndarray, at: np.ndarray, place: np.ndarray,
+    heading: np.ndarray, reach: float, reach_heading: float,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """`compare_view` at each of the poses [P, 3] with variances [P] of position and heading."""
+    best, off = np.empty(len(at)), np.empty((len(at), 3))
+    for k in range(len(at)):
+        near, turn = grown_reaches(reach, reach_heading, place[k], heading[k])
+        best[k], off[k, 0], off[k, 1], off[k, 2] = compare_view(poses, turns, gain, at[k], near, turn)
+    return best, off
+
+
+@compiled
+def move_pose(pose: np.ndarray, motion: np.ndarray) -> None:
+    """Moves a pose [3] by a motion [3]."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    pose[0], pose[1] = pose[0] + c * motion[0] - s * motion[1], pose[1] + s * motion[0] + c * motion[1]
+    pose[2] = wrapped(pose[2] + motion[2])
+
+
+@compiled
+def follow_track(
+    ground: np.ndarray, turns: np.ndarray, gains: np.ndarray, frames: np.ndarray, motions: np.ndarray,
+    variances: np.ndarray, spread: np.ndarray, reach: float, reach_heading: float, edges: np.ndarray,
+    odds: np.ndarray, least: float, start: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """`advance` from view to view with variances of position and heading alone, in one compiled loop because
+    hundreds of tracks are followed.
+
+    Args:
+        ground: [N, 3] poses of the keyframes. gains: [M, S, N] of all views. frames: [n] the views that are
+            followed. motions, variances: [n, 3] of the odometry into each. spread: [3] variance of a pose
+            found by comparing views, and of `start` [3]. edges, odds: see `GainOdds`. least: log-odds of the
+            last `WINDOW` views below which a track ends.
+
+    Returns:
+        poses [n, 3] before and after each view; the best gain [n], NaN where no keyframe is near; log-odds
+        [n] of the views.
+    """
+    count = len(frames)
+    before, after, best, gained = np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count)
+    pose, place, heading = start.copy(), spread[0], spread[2]  # with its variances
+    inside, recent = True, 0.0
+    for k in range(count):
+        move_pose(pose, motions[k])
+        place += variances[k, 0] + heading * (motions[k, 0] ** 2 + motions[k, 1] ** 2)
+        heading += variances[k, 2]
+        before[k] = pose
+        near, turn = grown_reaches(reach, reach_heading, place, heading)
+        best[k], dx, dy, da = compare_view(ground, turns, gains[frames[k]], pose, near, turn)
+        if best[k] > 0:
+            share, turned = place / (place + spread[0]), heading / (heading + spread[2])
+            pose[0], pose[1] = pose[0] + share * dx, pose[1] + share * dy
+            pose[2] = wrapped(pose[2] + turned * da)
+            place, heading = place * (1 - share), heading * (1 - turned)
+        after[k] = pose
+        if np.isnan(best[k]):
+            gained[k] = LEAVING if inside else 0.0
+        else:
+            gained[k] = odds[np.searchsorted(edges, best[k])]
+        inside = not np.isnan(best[k])
+        recent += gained[k] - (gained[k - WINDOW] if k >= WINDOW else 0.0)
+        if recent < least:
+            count = k + 1
+            break
+    return before[:count], after[:count], best[:count], gained[:count]
 
 
 BINS = 24
@@ -272,10 +350,6 @@ FARTHEST = 20.0
 more."""
 OUTLIERS = 0.04
 """Share of either distribution that is drawn from the other: something has changed, or was misread."""
-LEAVING = -2.0
-"""Log-odds of leaving mapped ground: false pose hypotheses do so more often than true ones."""
-
-
 GainPrior = tuple[tuple[float, float], tuple[float, float]]
 """Gains before any were counted: mean and standard deviation at true and at false poses, nat."""
 
@@ -295,6 +369,8 @@ class GainOdds(NamedTuple):
         return float(self.odds[np.searchsorted(self.edges, gain)])
 
 
+EVEN = GainOdds(np.arange(BINS - 1.0), np.zeros(BINS), 0.0)
+"""Odds that say nothing."""
 PRIOR: GainPrior = ((1.9, 0.8), (0.5, 1.6))
 """Of plain gains."""
 

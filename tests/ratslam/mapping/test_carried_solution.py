@@ -14,6 +14,8 @@ from ratslam.mapping.appearance import SAME_ID_LOG_ODDS
 from ratslam.mapping.carried_solution import (
     JUMP,
     LONGEST,
+    LOST,
+    SelfTraverse,
     add_closures_along,
     is_retraced,
     learn_odds,
@@ -23,7 +25,6 @@ from ratslam.mapping.carried_solution import (
 from ratslam.mapping.ground import LEAVING, REACH, REACH_HEADING, GainOdds, Ground
 from ratslam.mapping.loop_closures import ClosureLog, Verdict
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.pose_tracks import LOST, SelfTraverse
 from tactile.base.se2 import between, integrate
 from tactile.base.types import Odometry, observation
 from tests.ratslam.mapping.map_cases import CELL, Pose, Seen, new_map
