@@ -200,7 +200,7 @@ def advance(
     at = at.moved(moved)
     if gain is None:
         return at, None
-    reaches = grown_reaches(ground.reach, ground.reach_heading, *at.variances())
+    reaches = _grown_reaches(ground.reach, ground.reach_heading, *at.variances())
     best, *off = compare_view(ground.poses, ground.turns, gain.astype(float), at.pose, *reaches)
     return (_corrected(ground, at, np.array(off)) if best > 0 else at), best
 
@@ -236,7 +236,7 @@ WINDOW = 15
 
 
 @compiled
-def grown_reaches(reach: float, reach_heading: float, place: float, heading: float) -> tuple[float, float]:
+def _grown_reaches(reach: float, reach_heading: float, place: float, heading: float) -> tuple[float, float]:
     """The reaches, m and rad, of a pose with these variances of position and heading, from those of the
     ground."""
     far = min(reach + DEVIATIONS * np.sqrt(place), MOST_REACH * reach)
@@ -280,7 +280,7 @@ def _compare_at_all(
     """`compare_view` at each of the poses [P, 3] with variances [P] of position and heading."""
     best, off = np.empty(len(at)), np.empty((len(at), 3))
     for k in range(len(at)):
-        near, turn = grown_reaches(reach, reach_heading, place[k], heading[k])
+        near, turn = _grown_reaches(reach, reach_heading, place[k], heading[k])
         best[k], off[k, 0], off[k, 1], off[k, 2] = compare_view(poses, turns, gain, at[k], near, turn)
     return best, off
 
@@ -321,7 +321,7 @@ def follow_track(
         place += variances[k, 0] + heading * (motions[k, 0] ** 2 + motions[k, 1] ** 2)
         heading += variances[k, 2]
         before[k] = pose
-        near, turn = grown_reaches(reach, reach_heading, place, heading)
+        near, turn = _grown_reaches(reach, reach_heading, place, heading)
         best[k], dx, dy, da = compare_view(ground, turns, gains[frames[k]], pose, near, turn)
         if best[k] > 0:
             share, turned = place / (place + spread[0]), heading / (heading + spread[2])
