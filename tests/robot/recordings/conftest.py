@@ -1,11 +1,6 @@
 """Samples of all kinds for recordings, and their comparison to the bit; a small recording."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,35 +13,28 @@ from tactile.whisker_geometry import HeadConfig
 
 SHAPE, WHISKERS = (2, 3, 2), 4
 LIKE = SourceDescription(SHAPE, WHISKERS)
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-"""First bytes of a compressed chunk."""
+CALIBRATION = Calibration(
+    mean=np.zeros((2, 2)), sd=np.array([[1e-3, 0.1], [1e-300, -0.0]]), alive=np.array([True, False]),
+    threshold=np.array([[np.inf, 1 / 3], [0.1, 5e-324]]), free=np.array([0.7, 0.0]), rate=2000.0,
+)  # fmt: skip
 INFO = SourceInfo(
-    raw_whiskers=True,
-    head=HeadConfig(rest_deg=74.0),
-    calibration=Calibration(
-        mean=np.zeros((2, 2)),
-        sd=np.array([[1e-3, 0.1], [1e-300, -0.0]]),
-        threshold=np.array([[np.inf, 1 / 3], [0.1, 5e-324]]),
-        free=np.array([0.7, 0.0]),
-        alive=np.array([True, False]),
-        rate=2000.0,
-    ),
+    raw_whiskers=True, head=HeadConfig(rest_deg=74.0), calibration=CALIBRATION,
     maze=MazeInfo(text="o---o\n|   |\no---o\n", heights=(0.05, 0.02), seed=3),
     provenance={"über": None, "numbers": [0.1, -0.0]},
-)
+)  # fmt: skip
 
 
-def leaves(sample: Sample) -> list[Any]:
-    parts: list[Any] = [np.float64(sample.time), type(sample.reading), sample.truth is None]
+def leaves(sample):
+    parts = [np.float64(sample.time), type(sample.reading), sample.truth is None]
     odometry = sample.reading.odometry
     rest = sample.reading._replace(odometry=None)
     return [*parts, *odometry, *(part for part in rest if part is not None), sample.truth]
 
 
-def same_bits(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
+def same_bits(one, other):
     """Whether two sequences of samples are equal in every bit, shape and dtype."""
 
-    def key(value: Any) -> Any:
+    def key(value):
         if isinstance(value, (np.ndarray, np.generic)):
             return np.asarray(value).tobytes(), np.shape(value), np.asarray(value).dtype
         return value
@@ -56,7 +44,7 @@ def same_bits(one: Sequence[Sample], other: Sequence[Sample]) -> bool:
     )
 
 
-def write_recording(path: Path, samples: Sequence[Sample], **options: Any) -> Path:
+def write_recording(path, samples, **options):
     path.unlink(missing_ok=True)
     with Recorder(path, replace(LIKE, rate_hz=2.0, info=INFO), **options) as recorder:
         for sample in samples:
@@ -64,15 +52,15 @@ def write_recording(path: Path, samples: Sequence[Sample], **options: Any) -> Pa
     return path
 
 
-def some_samples(count: int, seed: int = 0, extreme: bool = False) -> list[Sample]:
+def some_samples(count, seed=0, extreme=False):
     """Samples of all kinds, every field filled; extreme: with numbers of any size where none is judged."""
     rng = np.random.default_rng(seed)
 
-    def numbers(*shape: int) -> np.ndarray:
+    def numbers(*shape):
         found = np.frombuffer(rng.bytes(8 * int(np.prod(shape))), np.float64).reshape(shape)
         return np.where(np.isfinite(found), found, -0.0) if extreme else rng.normal(size=shape)
 
-    def flags(*shape: int) -> np.ndarray:
+    def flags(*shape):
         return rng.random(shape) < 0.5
 
     samples = []
@@ -80,7 +68,6 @@ def some_samples(count: int, seed: int = 0, extreme: bool = False) -> list[Sampl
         odometry = Odometry(*(np.float64(x) for x in (*rng.normal(0, 0.05, 3), 0.5)))
         truth = rng.normal(0, 0.05, size=3) if i % 3 else None
         rows = int(rng.integers(6)) if extreme else 3
-        reading: Any
         if i % 5 == 4:
             kind = rng.integers(4, size=2).tolist()
             reading = Report(odometry, *kind, *flags(2, WHISKERS), numbers(rows), numbers(rows, WHISKERS, 2))
@@ -106,7 +93,7 @@ def some_samples(count: int, seed: int = 0, extreme: bool = False) -> list[Sampl
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[Sample]]:
+def small(tmp_path_factory):
     """A small recording of several chunks: its bytes and its samples."""
     samples = some_samples(9)
     path = write_recording(tmp_path_factory.mktemp("small") / "small.mcap", samples, chunk_s=1.5)

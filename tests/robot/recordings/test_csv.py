@@ -1,11 +1,5 @@
 """CSV recordings: configured columns are read, and every error names file and line."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,20 +11,18 @@ from robot.recordings.csv_file import read_csv
 from robot.recordings.csv_reader import read_csv_recording
 from robot.recordings.input_judge import InputJudge
 from robot.recordings.npz_trace import read_trace
-from robot.sources.in_memory import InMemorySource, truncate_log
+from robot.sources.in_memory import truncate_log
 from robot.sources.odometry import from_poses
 from robot.sources.source import Source
-from tactile.base.errors import InputError, InputErrors
+from tactile.base.errors import InputErrors
 from tactile.base.se2 import integrate
 
 ODOMETRY = "t,vx,w\n0.0,0.2,0.0\n0.5,0.2,0.1\n1.0,0.2,0.0\n1.5,0.2,0.0\n"
-Write = Callable[..., Path]
-Refused = Callable[..., InputError]
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Write:
-    def to_file(content: str, name: str = "odometry.csv") -> Path:
+def write(tmp_path):
+    def to_file(content, name="odometry.csv"):
         path = tmp_path / name
         path.write_text(content)
         return path
@@ -38,13 +30,13 @@ def write(tmp_path: Path) -> Write:
     return to_file
 
 
-def read(path: Path, warn: Callable[[str], None] | None = None, **parts: Any) -> InMemorySource:
+def read(path, warn=None, **parts):
     """Reads velocities, or another odometry if `parts` name one, with three pixels a view."""
     table = {"rows": 1, "columns": 3} | ({} if {"pose", "motion"} & set(parts) else {"velocity": {}}) | parts
     return read_csv_recording(path, CsvConfig.model_validate(table), InputJudge(warn=warn))
 
 
-def test_velocities_are_integrated_along_the_mid_heading(write: Write) -> None:
+def test_velocities_are_integrated_along_the_mid_heading(write):
     source = read(write(ODOMETRY))
     assert isinstance(source, Source)
     assert (source.name, source.length, source.rate_hz, source.view_shape) == ("odometry", 4, 2.0, (1, 3, 1))
@@ -57,20 +49,12 @@ def test_velocities_are_integrated_along_the_mid_heading(write: Write) -> None:
     np.testing.assert_allclose(read(write(rows, "motions.csv"), motion={}).motion, source.motion, atol=1e-15)
 
 
-def test_poses_are_differenced(write: Write) -> None:
-    path = write("time, px, py, th\n1,0,0,1.5707963267948966\n2,0,1,1.5707963267948966\n3,-0.5,1,3.3\n")
-    source = read(path, time="time", pose={"x": "px", "y": "py", "heading": "th"})
-    assert source.motion[1:] == pytest.approx(np.array([[1, 0, 0, 1], [0, 0.5, 3.3 - np.pi / 2, 1]]))
-
-
-def test_ranges_are_averaged_to_pixels(write: Write) -> None:
+def test_views_are_averages_of_ranges_or_pixels_of_another_file(write):
     path = write("t,vx,w,r0,r1,r2,r3,r4,r5\n0,0.1,0,1,3,8,9,inf,4\n1,0.1,0,,,,,,\n")
     source = read(path, views={"max_range": 8.0})
     assert source.views[0].ravel().tolist() == [0.25, 1.0, 0.75]
     assert source.seen.tolist() == [True, False]
-
-
-def test_views_of_another_file_are_assigned_to_the_nearest_row(write: Write) -> None:
+    # Views of another file are assigned to the nearest row.
     views = write("stamp,p2,p1,p3\n0.1,.2,.1,.3\n0.9,.5,.4,.6\n", "views.csv")
     part = {"file": views, "time": "stamp", "prefix": "p", "tolerance": 0.11}
     source = read(write(ODOMETRY), views=part)
@@ -78,7 +62,7 @@ def test_views_of_another_file_are_assigned_to_the_nearest_row(write: Write) -> 
     assert source.views[2].ravel().tolist() == [0.4, 0.5, 0.6]
 
 
-def test_contacts_lie_at_the_radius_in_the_direction_of_their_sensors(write: Write) -> None:
+def test_contacts_lie_at_the_radius_in_the_direction_of_their_sensors(write):
     file = write("t,right,left\n0.45,0,1\n1.1,1,1\n", "bumps.csv")
     part = {"file": file, "directions": {"left": 90.0, "right": -90.0}, "distance": 0.2}
     source = read(write(ODOMETRY), contacts=part)
@@ -94,15 +78,13 @@ def test_contacts_lie_at_the_radius_in_the_direction_of_their_sensors(write: Wri
     assert [sample.reading.contact.any() for sample in again] == [False, True]
 
 
-def test_labels_of_the_odometry_file_of_another_and_of_pairs(write: Write) -> None:
+def test_labels_of_the_odometry_file_and_of_another(write):
     path = write("t,vx,w,place\n0,0.1,0,3\n1,0.1,0,\n2,0.1,0,-1\n3,0.1,0,0\n")
     source = read(path, labels={"column": "place"})
     assert source.label.tolist() == [3, -1, -1, 0]
     assert not source.seen.any()
     labels = write("t,label\n0.51,7\n1.49,8\n", "labels.csv")
     assert read(write(ODOMETRY), labels={"file": labels}).label.tolist() == [-1, 7, -1, 8]
-    pairs = write("t1,t2,score\n1.0,0.5,0.9\n1.5,1.0,0.7\n", "pairs.csv")
-    assert read(write(ODOMETRY), pairs={"file": pairs}).label.tolist() == [-1, 0, 0, 1]
 
 
 PAIRS = st.tuples(st.integers(0, 8), st.integers(1, 8), st.sampled_from([0.5, 0.75, 0.8, 0.9]))
@@ -124,7 +106,7 @@ def test_labels_follow_the_best_earlier_match(tmp_path_factory, triples):
         new += not matches
 
 
-def test_truth_is_interpolated_and_unwrapped(write: Write) -> None:
+def test_truth_is_interpolated_and_unwrapped(write):
     truth = write("t,x,y,heading\n0.25,0,0,3.0\n1.25,1,2,-3.0\n", "truth.csv")
     found = read(write(ODOMETRY), truth={"file": truth}).truth
     turn = 2 * np.pi - 6
@@ -132,16 +114,14 @@ def test_truth_is_interpolated_and_unwrapped(write: Write) -> None:
     assert np.isnan(found[[0, 3]]).all()
     path = write("t,vx,w,x,y,heading\n0,0.1,0,1,2,3\n1,0.1,0,1.1,2,3\n")
     assert read(path, truth={}).truth.tolist() == [[1, 2, 3], [1.1, 2, 3]]
+    # The digest covers every file.
+    path, *others = (write(ODOMETRY), {}, {"truth": {"file": truth}})
+    digests = [read(path, **parts).digest for parts in others]
+    truth.write_text(truth.read_text().replace("3.0", "3.00"))
+    assert len({*digests, read(path, truth={"file": truth}).digest}) == 3
 
 
-def test_the_digest_covers_every_file(write: Write) -> None:
-    truth, path = write("t,x,y,heading\n0,0,0,0\n2,1,0,0\n", "truth.csv"), write(ODOMETRY)
-    one = read(path, truth={"file": truth}).digest
-    truth.write_text("t,x,y,heading\n0,0,0,0\n2,1,0,0.0\n")
-    assert len({one, read(path, truth={"file": truth}).digest, read(path).digest}) == 3
-
-
-def test_the_lecture_hall_csv_equals_its_reference_trace(reference_data: Path) -> None:
+def test_the_lecture_hall_csv_equals_its_reference_trace(reference_data):
     """Every label of the reference stream follows from the pairs; truth differs by rounding in the files."""
     data = reference_data / "data"
     pairs = {"file": data / "tuc_lecture_hall_loops.csv"}
@@ -156,7 +136,7 @@ def test_the_lecture_hall_csv_equals_its_reference_trace(reference_data: Path) -
     np.testing.assert_allclose(log.truth[known], stream.truth[known], atol=1e-6)
 
 
-def test_the_intel_laser_csv_equals_its_reference_trace(reference_data: Path) -> None:
+def test_the_intel_laser_csv_equals_its_reference_trace(reference_data):
     """180 beams as 3 x 6 pixels, equal in every bit; the sideways part of the motion is kept."""
     data = reference_data / "data"
     pose = {"x": "odo_x", "y": "odo_y", "heading": "odo_th"}
@@ -170,11 +150,11 @@ def test_the_intel_laser_csv_equals_its_reference_trace(reference_data: Path) ->
     assert np.abs(log.motion[:, 1]).max() > 0.1
 
 
-RANGES: dict[str, Any] = {"views": {"max_range": 8}}
-VIEWS: dict[str, Any] = {"views": {}}
-LEFT: dict[str, Any] = {"contacts": {"directions": {"left": 45.0}}}
-POSE: dict[str, Any] = {"pose": {}}
-TURNED: dict[str, Any] = {"pose": {"quaternion": ["a", "b", "c", "d"]}}
+RANGES = {"views": {"max_range": 8}}
+VIEWS = {"views": {}}
+LEFT = {"contacts": {"directions": {"left": 45.0}}}
+POSE = {"pose": {}}
+TURNED = {"pose": {"quaternion": ["a", "b", "c", "d"]}}
 LONG = f"t,vx,w,s\n0,1,0,{'x' * (1 << 20)}\n"
 STATED, OF_TIME = "t,vx [furlong/s],w\n0,1,0\n", "t [mm],vx,w\n0,1,0\n"
 ROUNDED = "t,vx,w\n" + "".join(f"{k // 4},1,{k}\n" for k in range(16))
@@ -182,7 +162,7 @@ HOLE = "t,vx,w\n" + "".join(f"{k},1,{'x' if 9 < k < 15 else 0}\n" for k in range
 QUATERNIONS = "t,x,y,a,b,c,d\n0,0,0,0,0,0,1\n1,0,0,0,0,0,0\n2,0,0,1,1,0,1\n"
 PLANE = "t,x,y,z,heading\n0,0,0,0,0\n1,1,0,1,0\n2,2,.01,3,0\n"
 SET_BACK = "t,vx,w\n" + "".join(f"{k - 2 * (k > 50)},1,0\n" for k in range(99))
-FAULTS: dict[str, tuple[str, dict[str, Any], list[str]]] = {
+FAULTS = {
     "column": ("t,vxs,w\n0,1,0\n", {}, [":1: no column 'vx'", "among 't', 'vxs', 'w'", "mean 'vxs'?"]),
     "key": ("stamp,vx,w\n0,1,0\n", {}, [":1: no column 't'", "name the column with table.time"]),
     "word": ("t,vx,w\n0,1,0\n1,f\x1b,0\n2,x,0\n3,,0\n", {}, [r":3: vx is 'f\x1b' (and so in 1 m", ":5: vx"]),
@@ -232,7 +212,7 @@ def test_faulty_values_are_refused(content, parts, pieces, write, refused):
     refused(lambda: read(path, **parts), str(path), *pieces)
 
 
-OTHERS: dict[str, tuple[str, str, list[str]]] = {
+OTHERS = {
     "far": ("views", "t,r0,r1,r2\n0,0,0,0\n9,0,0,0\n", [":3: the", "7.5 s away (one of 1", "at most 0.5 s"]),
     "two": ("views", "t,r0,r1,r2\n0.9,0,0,0\n1.1,0,0,0\n", [":3: belongs to the same odometry row"]),
     "time": ("views", "t,r0,r1,r2\n1,0,0,0\n0.5,0,0,0\n0,0,0,0\n", [":3: t goes back"]),
@@ -254,7 +234,7 @@ def test_faulty_values_in_other_files_are_refused(part, content, pieces, write, 
     refused(lambda: read(write(ODOMETRY), **{part: settings}), *pieces)
 
 
-def test_all_errors_are_reported_together(write: Write, refused: Refused) -> None:
+def test_all_errors_are_reported_together(write, refused):
     path = write("t,vx,w,r0,r1,r2\n0,nan,0,0,0,0\n1,nan,0,0,0,300\n1,1,0,0,0,0\n")
     error = refused(lambda: read(path, views={}), "vx is nan", "repeats", "300.0")
     assert isinstance(error, InputErrors)
@@ -263,7 +243,7 @@ def test_all_errors_are_reported_together(write: Write, refused: Refused) -> Non
     refused(lambda: read(path, **both), "both table.labels and table.pairs")
 
 
-LEFT_OUT: dict[str, tuple[str, dict[str, Any], list[float], list[str]]] = {
+LEFT_OUT = {
     "pose": ("t,x,y,heading\n0,0,0,0\n1,nan,0,0\n2,2,0,0\n3,3,0,0\n", POSE, [0, 2, 1],
              [":3: x is nan; expected a finite number; 1 of 4 rows are left out"]),
     "velocity": ("t,vx,w\n0,1,0\n1,fast,0\n2,1,0\n", {}, [0, 2], [":3: vx is 'fast'"]),
@@ -284,7 +264,7 @@ LEFT_OUT: dict[str, tuple[str, dict[str, Any], list[float], list[str]]] = {
 
 @pytest.mark.parametrize(("content", "parts", "moved", "pieces"), LEFT_OUT.values(), ids=LEFT_OUT.keys())
 def test_one_bad_row_is_left_out_with_a_warning(content, parts, moved, pieces, write):
-    said: list[str] = []
+    said = []
     path = write(content)
     source = read(path, said.append, **parts)
     assert source.motion[:, 0].tolist() == moved
@@ -303,7 +283,7 @@ DAYS = np.array([f"2024-05-01T10:00:{t:06.3f}" for t in TIME.tolist()])
 X, Y, H = POSES.T
 NAME, HEIGHT = np.full(24, "odom"), 1 + 0.01 * np.sin(TIME)
 RADS = np.degrees(H)
-AS_USERS_HAVE_THEM: dict[str, tuple[str, list[Any]]] = {
+AS_USERS_HAVE_THEM = {
     "text": ("t,frame_id,x,y,heading,note", [TIME, NAME, X, Y, H, np.full(24, "")]),
     "quoted text": ("t,x,y,heading,note", [TIME, X, Y, H, np.full(24, '"a, b"')]),
     "comments": ("# robot 7, Monday\n\n# of 3, 4, 5, 6\nt,x,y,heading", [TIME, X, Y, H]),
@@ -342,23 +322,21 @@ def test_a_file_as_users_have_it_is_read_as_the_doctor_describes_it(header, colu
     np.testing.assert_allclose(source.motion, from_poses(TIME, POSES), atol=3e-7)
 
 
-def test_settings_name_units_and_the_header_those_of_other_files(write: Write) -> None:
+def test_settings_name_units_and_the_header_those_of_other_files(write):
     """The unit in the settings goes before that of the header, for the odometry; speeds stay per second."""
     path = write("t [s],vx,w,r0,r1,r2\n0,200,0,,,\n500,200,5.729577951308232,,,\n")
-    views = write("stamp,r0 [mm],r1 [mm],r2 [mm]\n500,4000,8000,9000\n", "views.csv")
-    truth = write("t [s],x,y,heading\n0,0,0,0\n0.5,10,0,90\n", "truth.csv")
-    source = read(
-        path,
-        units={"time": "ms", "length": "mm", "angle": "deg"},
-        views={"file": views, "time": "stamp", "max_range": 8},
-        truth={"file": truth, "units": {"length": "cm", "angle": "deg"}},
-    )
+    units = {"time": "ms", "length": "mm", "angle": "deg"}
+    file = write("stamp,r0 [mm],r1 [mm],r2 [mm]\n500,4000,8000,9000\n", "views.csv")
+    views = {"file": file, "time": "stamp", "max_range": 8}
+    file = write("t [s],x,y,heading\n0,0,0,0\n0.5,10,0,90\n", "truth.csv")
+    truth = {"file": file, "units": {"length": "cm", "angle": "deg"}}
+    source = read(path, units=units, views=views, truth=truth)
     assert source.motion[1] == pytest.approx([0.1 * np.cos(0.025), 0.1 * np.sin(0.025), 0.05, 0.5])
     assert source.views[1].ravel().tolist() == [0.5, 1.0, 1.0]
     assert source.truth[1] == pytest.approx([0.1, 0, np.pi / 2])
 
 
-def test_views_of_rows_that_are_left_out_are_lost_with_them(write: Write) -> None:
+def test_views_of_rows_that_are_left_out_are_lost_with_them(write):
     rows = "".join(f"{k},1,0,3\n" for k in range(3, 41))
     odometry = write(f"t,vx,w,label\n0,1,0,0\n1,x,0,1\n2,1,0,2\n{rows}41")
     views = write("t,r0,r1,r2\n" + "".join(f"{k},0,0,{k % 2}\n" for k in range(42)), "views.csv")
@@ -367,16 +345,13 @@ def test_views_of_rows_that_are_left_out_are_lost_with_them(write: Write) -> Non
     assert source.seen.all()
     np.testing.assert_array_equal(source.views[:, 0, 2, 0], source.time % 2)
     assert source.label.tolist()[:3] == [0, 2, 3]
-
-
-def test_rows_are_counted_where_a_rate_is_given(write: Write) -> None:
+    # They count where a rate is given.
     path = write("t,vx,w\n7,1,0\n7,x,0\n7,1,0\n8,1,0\n")
     assert read(path, rate=4.0).time.tolist() == [7, 7.5, 7.75]
 
 
-def test_line_numbers_count_empty_lines(write: Write) -> None:
+def test_line_numbers_count_empty_lines(write):
     file = read_csv(write("\ufefft,x\r\n\r\n1,2\r\n \r\n3,4"))
-    assert file.names == ("t", "x")
-    assert file.values.tolist() == [[1, 2], [3, 4]]
+    assert (file.names, file.values.tolist()) == (("t", "x"), [[1, 2], [3, 4]])
     assert [file.place(row).rsplit(":", 1)[1] for row in (0, 1)] == ["3", "5"]
     assert read_csv(write('"t","x"\n"1","2"\n')).values.tolist() == [[1, 2]]

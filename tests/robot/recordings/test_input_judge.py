@@ -1,47 +1,42 @@
-"""Known recordings pass with a margin; the same data in wrong units, or with wrong steps, are found."""
-
-from __future__ import annotations
+"""Reference traces; known recordings pass with a margin, and wrong units, steps and values are found."""
 
 import re
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
+from evaluation.metrics.trajectory import ate
 from robot.recordings import input_judge as judging
-from robot.recordings.csv_config import CsvConfig, PoseColumns, TruthColumns, VelocityColumns
+from robot.recordings.csv_config import CsvConfig
 from robot.recordings.csv_reader import read_csv_recording
 from robot.recordings.formats import open_recording
 from robot.recordings.input_judge import DEFAULT_LIMITS, InputJudge, MotionTrack, UnitLimits
+from robot.recordings.mcap_reader import Recording
+from robot.recordings.mcap_writer import record_source
 from robot.recordings.npz_trace import read_trace
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import Stretch
-from robot.sources.in_memory import InMemorySource
 from robot.sources.odometry import OdometryCorrection, from_poses, from_velocities, replace_steps
-from tactile.base.errors import InputError
+from robot.sources.source import Source
+from tactile.base.errors import InputErrors
 from tactile.base.se2 import between, integrate
 from tests.robot.conftest import SYNTHETIC
 
 REAL = ("f_real_intel_laser3x6", "f_real_tuc_lecture_hall")
-Refused = Callable[..., InputError]
 DEGREES, MILLIMETRES, MILLISECONDS = 180 / np.pi, 1000.0, 1000.0
 
 
-@pytest.fixture(params=["intel", "lecture hall"])
-def table(request: pytest.FixtureRequest, reference_data: Path) -> tuple[Path, CsvConfig]:
-    """Each real recording as CSV, without its views."""
-    data = reference_data / "data"
-    if request.param == "intel":
-        truth = TruthColumns(x="gt_x", y="gt_y", heading="gt_th")
-        pose = PoseColumns(x="odo_x", y="odo_y", heading="odo_th")
-        return data / "intel_odom_gt.csv", CsvConfig(pose=pose, truth=truth)
-    truth = TruthColumns(file=data / "tuc_lecture_hall_gt.csv", heading="th")
-    return data / "tuc_lecture_hall_odom.csv", CsvConfig(velocity=VelocityColumns(left="vy"), truth=truth)
+def real_table(name, data):
+    """A real recording as CSV, without its views, and its settings."""
+    if name == "intel":
+        truth, pose = ({"x": f"{of}_x", "y": f"{of}_y", "heading": f"{of}_th"} for of in ("gt", "odo"))
+        return data / "intel_odom_gt.csv", CsvConfig.model_validate({"pose": pose, "truth": truth})
+    truth = {"file": data / "tuc_lecture_hall_gt.csv", "heading": "th"}
+    settings = {"velocity": {"left": "vy"}, "truth": truth}
+    return data / "tuc_lecture_hall_odom.csv", CsvConfig.model_validate(settings)
 
 
-def _check_margins(log: InMemorySource) -> None:
+def _check_margins(log):
     """Each limit is far above its quantity."""
     robot = judging.typical_motion(MotionTrack(log.time, log.moved, log.motion, log.truth))
     ratios = [max(pair) / min(pair) if min(pair) else 1.0 for pair in (robot.path, robot.turning)]
@@ -52,22 +47,15 @@ def _check_margins(log: InMemorySource) -> None:
     assert 20 * max(ratios) < judging.RATIO
 
 
-def test_real_tables_pass_with_a_margin(table: tuple[Path, CsvConfig]) -> None:
-    _check_margins(read_csv_recording(*table))
-
-
-PLANTED: list[tuple[str, Any, str]] = [
-    ("in_w", DEGREES, "in radians"),
-    ("in_v", MILLIMETRES, "in metres"),
-    ("in_view", 255.0, "in 0..1"),
-    ("in_t", MILLISECONDS, "times in seconds"),
+PLANTED = [
+    ("in_w", DEGREES, "in radians"), ("in_v", MILLIMETRES, "in metres"), ("in_view", 255.0, "in 0..1"),
+    ("in_t", MILLISECONDS, "times in seconds"), ("truth", np.array([1, 1, DEGREES]), "in radians"),
     ("truth", np.array([MILLIMETRES, MILLIMETRES, 1]), "truth in metres"),
-    ("truth", np.array([1, 1, DEGREES]), "in radians"),
-]
+]  # fmt: skip
 """By what an array is multiplied, and what is expected instead."""
 
 
-def _arrays(trace: Path) -> dict[str, np.ndarray]:
+def _arrays(trace):
     with np.load(trace) as arrays:
         names = [name for name in arrays.files if name.startswith("in_") or name in ("params_json", "truth")]
         return {name: arrays[name].copy() for name in names}
@@ -93,64 +81,56 @@ def test_traces_pass_with_a_margin_and_are_refused_in_a_wrong_unit(name, find_tr
 
 
 @pytest.mark.parametrize(
-    ("table", "column", "factor", "expected"),
+    ("name", "column", "factor", "expected"),
     [("intel", "odo_th", DEGREES, "a heading in radians"), ("intel", "odo_x", MILLIMETRES, "in metres"),
      ("intel", "gt_th", DEGREES, "a heading in radians"), ("intel", "t", MILLISECONDS, "times in seconds"),
      ("lecture hall", "t", MILLISECONDS, "times in seconds"), ("lecture hall", "w", DEGREES, "in radians"),
      ("lecture hall", "vx", MILLIMETRES, "in metres")],
-    indirect=["table"],
 )  # fmt: skip
-def test_a_wrong_unit_of_a_table_is_refused(table, column, factor, expected, tmp_path, refused):
-    path, config = table
+def test_wrong_units_of_tables_are_refused(name, column, factor, expected, reference_data, tmp_path, refused):
+    path, config = real_table(name, reference_data / "data")
     header, *_ = path.read_text().split("\n", 1)
     values = np.loadtxt(path, delimiter=",", skiprows=1)
     values[:, header.split(",").index(column)] *= factor
     planted = tmp_path / "planted.csv"
     np.savetxt(planted, values, "%.6f", ",", header=header, comments="")
-    refused(lambda: read_csv_recording(planted, config), str(planted), expected)
-    without_truth = config if column == "gt_th" else config.model_copy(update={"truth": None})
-    refused(lambda: read_csv_recording(planted, without_truth), expected)
+    for truth in (config.truth, config.truth if column == "gt_th" else None):
+        settings = config.model_copy(update={"truth": truth})
+        refused(lambda settings=settings: read_csv_recording(planted, settings), str(planted), expected)
 
 
-def _drive(rows: int = 400, interval: float = 0.1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+ROWS = np.arange(400)
+
+
+def _drive():
     """Times, velocities [N, 2] (m/s, rad/s) and poses of a robot that drives, stands and turns."""
-    time = np.arange(rows) * interval
-    phase = np.arange(rows) // 40 % 4
-    speeds = np.array([(0.4, 0.01), (0.4, 0.01), (0.0, 0.6), (0.0, 0.0)])[phase]
+    time, speeds = ROWS * 0.1, np.array([(0.4, 0.01), (0.4, 0.01), (0.0, 0.6), (0.0, 0.0)])[ROWS // 40 % 4]
     return time, speeds, integrate(from_velocities(time, speeds[:, 0], 0.0, speeds[:, 1])[:, :3])
 
 
-def _two_nodes(poses: np.ndarray) -> np.ndarray:
-    poses[1::2, :2] += np.linspace(0, 0.8, len(poses) // 2)[:, None]
-    return poses
+SLOWER = {"milliseconds": 1e3, "kiloseconds": 1e-4, "slow degrees": 10, "slow centimetres": 2.5}
+CHANGED = {
+    "wild": lambda poses: poses + 3.0 * (ROWS == 150)[:, None] * [1, 0, 0],
+    "reset": lambda poses: np.append(poses[:230], integrate(between(poses[229:-1], poses[230:])), axis=0),
+    "two nodes": lambda poses: poses + (ROWS % 2 * (ROWS - 1) * 0.8 / 398)[:, None] * [1, 1, 0],
+    "single precision": lambda poses: (poses + [4e5, 5e6, 0]).astype(np.float32).astype(float),
+    "centimetres": lambda poses: poses * [100, 100, 1],
+    "slow centimetres": lambda poses: poses * [100, 100, 1],
+    "kilometres": lambda poses: poses * [1e-3, 1e-3, 1],
+    "slow degrees": lambda poses: np.column_stack([poses[:, :2], np.degrees(np.unwrap(poses[:, 2]))]),
+}
 
 
-def _faulty(kind: str) -> MotionTrack:
+def _faulty(kind):
     """A drive with this fault: `A, B` where A is the fault and B what was recorded."""
+    fault, recorded = kind.split(", ")
     time, speeds, poses = _drive()
-    everywhere = np.ones(len(time), bool)
-    if kind.endswith("velocities"):
-        time = time + np.where(np.arange(len(time)) >= (290 if "standing" in kind else 220), 60.0, 0.0)
-        time = time * {"milliseconds": 1e3, "kiloseconds": 1e-4}.get(kind.split(",")[0], 1.0)
-        if "gap" not in kind:
-            time = np.arange(len(time)) * 0.1 * (time[1] / 0.1)
-        motion = from_velocities(time, speeds[:, 0], 0.0, speeds[:, 1])
-        return MotionTrack(time, everywhere, motion, held=True)
-    change: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-        "wild": lambda poses: poses + 3.0 * (np.arange(len(poses)) == 150)[:, None] * [1, 0, 0],
-        "reset": lambda poses: np.append(poses[:230], integrate(between(poses[229:-1], poses[230:])), axis=0),
-        "two nodes": _two_nodes,
-        "single precision": lambda poses: (poses + [4e5, 5e6, 0]).astype(np.float32).astype(float),
-        "centimetres": lambda poses: poses * [100, 100, 1],
-        "slow centimetres": lambda poses: poses * [100, 100, 1],
-        "kilometres": lambda poses: poses * [1e-3, 1e-3, 1],
-        "slow degrees": lambda poses: np.column_stack([poses[:, :2], np.degrees(np.unwrap(poses[:, 2]))]),
-    }
-    poses = change.get(kind.split(",")[0], lambda poses: poses)(poses)
-    time = time * {"slow degrees": 10, "slow centimetres": 2.5}.get(kind.split(",")[0], 1)
-    if "gap" in kind:
-        time = time + np.where(np.arange(len(time)) >= 120, 60.0, 0.0)
-    return MotionTrack(time, everywhere, from_poses(time, poses), poses=poses)
+    pause = {"gap": 220 if recorded == "velocities" else 120, "gap standing": 290}.get(fault, 400)
+    time = (time + 60.0 * (pause <= ROWS)) * SLOWER.get(fault, 1.0)
+    if recorded == "velocities":
+        return MotionTrack(time, ROWS >= 0, from_velocities(time, speeds[:, 0], 0.0, speeds[:, 1]), held=True)
+    poses = CHANGED.get(fault, lambda poses: poses)(poses)
+    return MotionTrack(time, ROWS >= 0, from_poses(time, poses), poses=poses)
 
 
 JUDGED = {
@@ -172,12 +152,11 @@ JUDGED = {
 
 
 @pytest.mark.parametrize("kind", JUDGED)
-def test_a_fault_of_the_odometry_is_judged(kind: str) -> None:
+def test_a_fault_of_the_odometry_is_judged(kind):
     refused, *pieces = JUDGED[kind]
-    told: list[str] = []
+    told = []
     errors = InputJudge(warn=told.append).errors(_faulty(kind), lambda row: f"row {row}", "file")
-    assert len(errors) == refused
-    assert len(told) == (not refused)
+    assert (len(errors), len(told)) == (refused, not refused)
     (said,) = [*map(str, errors), *told]
     for piece in pieces:
         assert piece in said
@@ -186,15 +165,14 @@ def test_a_fault_of_the_odometry_is_judged(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["clean, poses", "clean, velocities"])
-def test_a_clean_drive_has_no_finding(kind: str) -> None:
+def test_a_clean_drive_has_no_finding(kind):
     assert InputJudge(warn=pytest.fail).errors(_faulty(kind), str, "file") == []
 
 
 @pytest.mark.parametrize("kind", ["wild, poses", "reset, poses", "gap, velocities"])
-def test_the_printed_cure_repeats_the_step_before(kind: str) -> None:
+def test_the_printed_cure_repeats_the_step_before(kind):
     """The path that results is off by less than two steps."""
-    track = _faulty(kind)
-    told: list[str] = []
+    track, told = _faulty(kind), []
     errors = InputJudge(warn=told.append).errors(track, str, "file")
     (said,) = [*map(str, errors), *told]
     settings = {name: float(value) for name, value in re.findall(r"odometry\.(\w+)=([\d.]+)", said)}
@@ -204,7 +182,7 @@ def test_the_printed_cure_repeats_the_step_before(kind: str) -> None:
     assert np.hypot(*(mended - _drive()[2])[:, :2].T).max() < 0.09
 
 
-def test_two_wild_rows_are_a_jump_and_no_unit(trace: Path, tmp_path: Path, refused: Refused) -> None:
+def test_two_wild_rows_are_a_jump_and_no_unit(trace, tmp_path, refused):
     arrays, path = _arrays(trace), tmp_path / "wild.npz"
     for name, value in (("in_w", 1e5), ("in_v", 1e6)):
         arrays[name][[40, 41]] = value, -value
@@ -214,7 +192,7 @@ def test_two_wild_rows_are_a_jump_and_no_unit(trace: Path, tmp_path: Path, refus
         assert 0 < read_trace(path, InputJudge(stretch=stretch)).length < len(arrays["in_t"])
 
 
-def test_limits_can_be_raised(stream: Callable[..., Path], refused: Refused) -> None:
+def test_limits_can_be_raised(stream, refused):
     path = stream(in_v=np.full(12, 40.0), truth=None)
     refused(lambda: read_trace(path), "over 40 m/s", "raise recording.limits.speed (25)")
     config = RecordingConfig(file=path, limits=UnitLimits(speed=50.0))
@@ -222,7 +200,7 @@ def test_limits_can_be_raised(stream: Callable[..., Path], refused: Refused) -> 
 
 
 @pytest.mark.parametrize("turns", [0.4, 5.0])
-def test_headings_in_degrees_are_detected(turns: float) -> None:
+def test_headings_in_degrees_are_detected(turns):
     """Headings in radians pass, in degrees they are refused, wrapped or not."""
     time = np.arange(200) * 0.5
     heading = np.linspace(0, 2 * np.pi * turns, 200) - 1.0
@@ -235,7 +213,137 @@ def test_headings_in_degrees_are_detected(turns: float) -> None:
 
 
 @pytest.mark.parametrize("rows", [0, 1, 2, 3])
-def test_an_empty_track_is_accepted(rows: int) -> None:
+def test_an_empty_track_is_accepted(rows):
     still = MotionTrack(np.arange(rows) * 1.0, np.ones(rows, bool), np.zeros((rows, 4)), np.zeros((rows, 3)))
     assert judging.unit_errors(still, "file") == []
     assert judging.unit_errors(still._replace(moved=np.zeros(rows, bool), truth=None), "file") == []
+
+
+def test_a_trace_is_read_row_by_row(trace):
+    source = read_trace(trace)
+    assert isinstance(source, Source)
+    with np.load(trace) as arrays:
+        np.testing.assert_array_equal(source.time, arrays["in_t"])
+        np.testing.assert_array_equal(source.views.reshape(source.length, -1), arrays["in_view"])
+        np.testing.assert_array_equal(source.truth, arrays["truth"])
+        step = np.diff(arrays["in_t"], prepend=arrays["in_t"][:1])
+        way, turn = arrays["in_v"] * step, arrays["in_w"] * step
+    # Motion is along the heading after the turn of a row.
+    moved = np.column_stack([way * np.cos(turn), way * np.sin(turn), turn, step])
+    np.testing.assert_allclose(source.motion, moved, atol=1e-12)
+    assert (source.name, source.view_shape, source.whiskers) == (trace.stem, (3, 6, 1), 0)
+    assert source.rate_hz == pytest.approx(2.0)
+    assert source.seen.all()
+    parameters = source.info.provenance["parameters"]
+    assert (parameters["exp_loops"], type(parameters["vt_match_threshold"])) == (20, float)
+
+
+PUBLISHED = {"b_figure8_alias": 0.174, "f_real_intel_laser3x6": 24.16, "f_real_tuc_lecture_hall": 12.95}
+
+
+@pytest.mark.parametrize(("name", "expected"), PUBLISHED.items())
+def test_the_error_of_raw_odometry_is_the_published_one(name, expected, find_trace):
+    source = read_trace(find_trace(name))
+    assert ate(integrate(source.motion[:, :3]), source.truth) == pytest.approx(expected, rel=3e-3)
+
+
+def test_rows_without_odometry_do_not_advance_its_clock(stream):
+    flags = np.full(12, 3.0)
+    flags[[0, 4, 5]], flags[7] = 1, 2
+    source = read_trace(stream(in_flags=flags, in_v=np.where(flags == 1, np.nan, 0.1)))
+    assert source.motion[:, 3].tolist() == [0, 0, 0.5, 0.5, 0, 0, 1.5, 0.5, 0.5, 0.5, 0.5, 0.5]
+    assert source.seen.tolist() == [i != 7 for i in range(12)]
+    assert ((source.motion[:, 0] != 0) == (source.motion[:, 3] > 0)).all()
+    assert (source.views[7] == 0).all()
+    # A view may share its time with odometry.
+    time, flags = 100 + 0.5 * (np.arange(12) // 2), np.tile([1.0, 2.0], 6)
+    assert read_trace(stream(in_t=time, in_flags=flags)).rate_hz == 2.0
+
+
+def test_views_of_two_columns_are_place_labels(stream, tmp_path):
+    """Unless the template has two pixels."""
+    ids = np.column_stack([np.arange(12) // 3, np.zeros(12)])
+    ids[4] = np.nan
+    source = read_trace(stream(in_view=ids, in_flags=np.where(np.isnan(ids[:, 0]), 2.0, 3.0)))
+    assert source.label.tolist() == [0, 0, 0, 1, -1, 1, 2, 2, 2, 3, 3, 3]
+    assert (source.seen.any(), source.view_shape, source.info.labels_only) == (False, (2, 3, 1), True)
+    record_source(source, tmp_path / "labels.mcap")
+    assert Recording(tmp_path / "labels.mcap").info.labels_only
+    params = '{"template_x_size": 2, "template_y_size": 1}'
+    source = read_trace(stream(in_view=np.full((12, 2), 0.25), params_json=params, truth=None))
+    assert (source.views == 0.25).all()
+    assert (source.seen.all(), source.truth) == (True, None)
+
+
+def test_samples_share_no_writable_memory_and_the_digest_depends_on_the_content(stream):
+    source = read_trace(stream())
+    assert read_trace(stream()).digest == source.digest != read_trace(stream(in_v=np.full(12, 0.11))).digest
+    sample = next(iter(source))
+    sample.truth[:] = 9
+    with pytest.raises(ValueError, match="read-only"):
+        sample.reading.view[:] = 1
+    assert (next(iter(source)).truth == 0).all()
+
+
+def _with(array, row, value):
+    changed = np.array(array, dtype=np.float64)
+    changed[row] = value
+    return changed
+
+
+TIME, VIEW = 100 + 0.5 * np.arange(12), np.full((12, 6), 0.5)
+IDS = np.column_stack([np.arange(12), np.zeros(12)])
+FAULTS = {
+    "backwards": ({"in_t": _with(TIME, 5, 100.25)}, ["row 5: in_t goes back from 102.0 to 100.25 s", "sort"]),
+    "repeated": ({"in_t": _with(TIME, 5, 102)}, ["row 5: in_t repeats 102.0 s", "drop the repeated"]),
+    "nan time": ({"in_t": _with(TIME, 5, np.nan)}, ["row 5: in_t is nan", "correct or drop"]),
+    "inf speed": ({"in_v": _with(np.ones(12), 3, np.inf)}, ["row 3: in_v is inf", "a finite number"]),
+    "nan turn": ({"in_w": _with(np.ones(12), 3, np.nan)}, ["row 3: in_w is nan"]),
+    "nan view": ({"in_view": _with(VIEW, 7, np.nan)}, ["row 7: in_view is nan"]),
+    "nan truth": ({"truth": _with(np.zeros((12, 3)), 2, np.nan)}, ["row 2: truth is nan"]),
+    "bytes": ({"in_view": 255 * VIEW}, ["holds 127.5 (and so in 11 more rows)", "0..1", "by 255"]),
+    "below": ({"in_view": _with(VIEW, 3, -1)}, ["row 3: in_view holds -1.0;", "shift and scale"]),
+    "wide": ({"in_view": 9000 * VIEW}, ["by their largest possible value, at least 4500"]),
+    "flags": ({"in_flags": _with(np.full(12, 3), 4, 0)}, ["row 4: in_flags is 0.0", "1 (view), 2"]),
+    "view shape": ({"in_view": np.zeros((12, 5))}, ["in_view has 5 columns", "6 (template_y_size 2", "or 2"]),
+    "view rank": ({"in_view": np.zeros(12)}, ["in_view has shape [12]", "[N, V] with N = 12"]),
+    "length": ({"in_w": np.zeros(11)}, ["in_w has shape [11]", "[N] with N = 12, the rows of in_t"]),
+    "truth shape": ({"truth": np.zeros((12, 2))}, ["truth has shape [12, 2]", "[N, 3]"]),
+    "text": ({"in_v": np.full(12, "fast")}, ["in_v has dtype <U4", "real numbers"]),
+    "objects": ({"in_v": np.array([None] * 12)}, ["Object arrays cannot be loaded"]),
+    "absent": ({"in_veiw": VIEW, "in_view": None}, ["no array 'in_view'", "among 'in_t'", "mean 'in_veiw'?"]),
+    "two absent": ({"in_v": None, "in_w": None}, ["no array 'in_v'", "no array 'in_w'"]),
+    "no rows": ({"in_t": np.zeros(0)}, ["in_t has no rows", "at least one sample"]),
+    "json": ({"params_json": "{"}, ["params_json is not JSON", "a JSON object"]),
+    "list": ({"params_json": "[1]"}, ["params_json holds list"]),
+    "key": ({"params_json": '{"template_ysize": "3"}'}, ["no key 'template_y_size'", "'template_ysize'?"]),
+    "size": ({"params_json": '{"template_y_size": "x"}'}, ["template_y_size is 'x'", "of pixels"]),
+    "id": ({"in_view": _with(IDS, 2, [0.5, 0])}, ["row 2: in_view's place id is 0.5", "from 0"]),
+    "turned id": ({"in_view": _with(IDS, 2, [0, 0.1])}, ["in_view's relative angle is 0.1", "not supported"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "pieces"), FAULTS.values(), ids=FAULTS.keys())
+def test_faulty_values_are_refused(changes, pieces, stream, refused):
+    path = stream(**changes)
+    refused(lambda: read_trace(path), str(path), *pieces)
+
+
+def test_all_errors_are_reported_together(stream, refused):
+    turn, speed = _with(np.zeros(12), 3, np.nan), 1e3 * np.ones(12)
+    path = stream(in_t=_with(TIME, 5, 102), in_v=speed, in_w=turn, in_view=255 * VIEW)
+    error = refused(lambda: read_trace(path), "repeats", "in_w is nan", "127.5", "over 1000 m/s")
+    assert isinstance(error, InputErrors)
+    assert len(error.errors) == 4  # each cause once, although the truth contradicts the speed too
+
+
+def test_a_broken_archive_gives_one_error(stream, tmp_path, refused):
+    content = stream().read_bytes()
+    path = tmp_path / "bad.npz"
+    for size in [*range(1, len(content) - 1, 97), len(content) - 1]:
+        path.write_bytes(content[:size])
+        refused(lambda: read_trace(path), str(path), "cannot be read as .npz", "a NumPy archive")
+    refused(lambda: read_trace(path), "truncated or damaged: copy it again")
+    np.save(tmp_path / "single.npy", np.zeros(3))
+    (tmp_path / "single.npy").rename(path)
+    refused(lambda: read_trace(path), "cannot be read as .npz", "write it with numpy.savez")

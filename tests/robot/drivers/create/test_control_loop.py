@@ -1,21 +1,19 @@
-"""The control loop under faults of line and robot, in simulated time."""
-
-from __future__ import annotations
+"""Bytes and odometry of the Open Interface; the control loop under faults, in simulated time."""
 
 import contextlib
 import math
-from collections.abc import Callable
-from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
-from robot.drivers.create.driver import PAUSE, ControlLoop
+from robot.drivers.create.driver import PAUSE, ControlLoop, CreateOdometry
 from robot.drivers.create.driver_config import CommandRefused, CreateConfig, StopReason
 from robot.drivers.create.serial_link import SerialLink
 from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
+from tactile.base.se2 import compose
 
 PERIOD = 0.05
 NUMBER = st.one_of(st.floats(-0.3, 0.3), st.floats())
@@ -25,70 +23,57 @@ class Line:
     """A serial port in memory: commands reach the robot at once, `mangle` changes its replies.
 
     Attributes:
-        now: its clock, s; a read that times out advances it.
+        now: its clock, s; a read that times out advances it. waiting: bytes that a read gives.
     """
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.robot = EmulatedCreate(CreateEmulatorConfig())
-        self.now, self.timeout = 100.0, 0.0
-        self.mangle: Callable[[bytes], bytes] = lambda reply: reply
-        self.gone = False
-        self._waiting = b""
+        self.now, self.timeout, self.gone, self.waiting = 100.0, 0.0, False, b""
+        self.mangle = lambda reply: reply
 
-    def wait(self, seconds: float) -> None:
+    def wait(self, seconds):
         self.now += seconds
         self.robot.advance(seconds)
 
-    def clock(self) -> float:
-        return self.now
-
     @property
-    def in_waiting(self) -> int:
+    def in_waiting(self):
         self._attached()
-        return len(self._waiting)
+        return len(self.waiting)
 
-    def read(self, size: int = 1) -> bytes:
+    def read(self, size=1):
         self._attached()
-        data, self._waiting = self._waiting[:size], self._waiting[size:]
+        data, self.waiting = self.waiting[:size], self.waiting[size:]
         if len(data) < size:
             self.wait(self.timeout or 0.0)
         return data
 
-    def write(self, data: bytes) -> int:
+    def write(self, data):
         self._attached()
         for reply in self.robot.receive(data):
-            self._waiting += self.mangle(reply)
+            self.waiting += self.mangle(reply)
         return len(data)
 
-    def arrive(self, data: bytes) -> None:
-        """Makes bytes arrive without a query."""
-        self._waiting += data
+    def close(self): ...
 
-    def close(self) -> None: ...
-
-    def _attached(self) -> None:
+    def _attached(self):
         if self.gone:
             raise OSError(5, "Input/output error")
 
-    def control_loop(self, **settings: Any) -> ControlLoop:
+    def control_loop(self, **settings):
         """A control loop of this robot, which is awake and in safe mode."""
         link = SerialLink(self)
         for command in (protocol.START, protocol.SAFE):
             link.send(command)
             self.wait(PAUSE)
         link.ask(float("inf"))
-        return ControlLoop(CreateConfig(**settings), link, self.clock)
+        return ControlLoop(CreateConfig(**settings), link, lambda: self.now)
 
 
-def rolls(robot: EmulatedCreate) -> bool:
+def rolls(robot):
     return bool(robot.right or robot.left)
 
 
-def check_stop(loop: ControlLoop, reason: StopReason) -> None:
-    assert loop.active_stop.reason is reason
-
-
-def drive(line: Line, loop: ControlLoop, seconds: float, forward: float, turn: float = 0.0) -> None:
+def drive(line, loop, seconds, forward, turn=0.0):
     """Polls and steers for some seconds; refused commands are repeated."""
     for _ in range(round(seconds / PERIOD)):
         try:
@@ -100,17 +85,17 @@ def drive(line: Line, loop: ControlLoop, seconds: float, forward: float, turn: f
 
 
 @pytest.fixture
-def line() -> Line:
+def line():
     return Line()
 
 
 @pytest.fixture
-def loop(line: Line) -> ControlLoop:
+def loop(line):
     return line.control_loop()
 
 
 @given(st.floats(0.01, 0.5), st.lists(st.tuples(NUMBER, NUMBER), max_size=10))
-def test_speeds_above_the_limit_are_not_sent(cap: float, wanted: list[tuple[float, float]]) -> None:
+def test_speeds_above_the_limit_are_not_sent(cap, wanted):
     line = Line()
     loop = line.control_loop(speed=cap)
     for forward, turn in wanted:
@@ -122,7 +107,7 @@ def test_speeds_above_the_limit_are_not_sent(cap: float, wanted: list[tuple[floa
     assert all(max(abs(right), abs(left)) <= 1000 * cap + 1e-6 for _, right, left in line.robot.drives)
 
 
-def test_a_command_that_is_not_renewed_ends(line: Line) -> None:
+def test_a_command_that_is_not_renewed_ends(line):
     loop = line.control_loop(patience=0.5)
     loop.steer(0.1, 0.0)
     rolled = []
@@ -137,12 +122,12 @@ def test_a_command_that_is_not_renewed_ends(line: Line) -> None:
     assert rolls(line.robot)
 
 
-def test_a_bump_stops_forward_motion_only(line: Line, loop: ControlLoop) -> None:
+def test_a_bump_stops_forward_motion_only(line, loop):
     drive(line, loop, 0.5, 0.1)
     line.robot.touch(protocol.Bumps.LEFT)
     loop.poll()
     assert not rolls(line.robot)
-    check_stop(loop, StopReason.BUMPED)
+    assert loop.active_stop.reason is StopReason.BUMPED
     assert "left" in str(loop.active_stop)
     with pytest.raises(CommandRefused, match="bumped"):
         loop.steer(-0.1, 0.0)
@@ -161,7 +146,7 @@ def test_a_dropped_wheel_stops_the_robot_until_it_stands(dropped, forward, line,
     drive(line, loop, 0.2, forward, 0.2)
     line.robot.touch(dropped)
     drive(line, loop, 0.2, forward, 0.2)
-    check_stop(loop, StopReason.WHEEL_DROP)
+    assert loop.active_stop.reason is StopReason.WHEEL_DROP
     loop.release()
     drive(line, loop, 0.2, forward, 0.2)
     assert loop.active_stop is not None  # the wheel still hangs
@@ -171,11 +156,11 @@ def test_a_dropped_wheel_stops_the_robot_until_it_stands(dropped, forward, line,
     assert rolls(line.robot)
 
 
-def test_safe_mode_is_entered_again_by_release_only(line: Line, loop: ControlLoop) -> None:
+def test_safe_mode_is_entered_again_by_release_only(line, loop):
     drive(line, loop, 0.2, 0.1)
     line.robot.touch(protocol.Bumps(0), cliff=True)
     drive(line, loop, 1.0, 0.1)
-    check_stop(loop, StopReason.LEFT_SAFE_MODE)
+    assert loop.active_stop.reason is StopReason.LEFT_SAFE_MODE
     assert line.robot.mode == protocol.Mode.PASSIVE
     loop.release()
     drive(line, loop, 0.2, 0.1)
@@ -184,14 +169,14 @@ def test_safe_mode_is_entered_again_by_release_only(line: Line, loop: ControlLoo
 
 
 @pytest.mark.parametrize(("reply", "halt"), [(b"", StopReason.SILENT), (b"\xff" * 6, StopReason.GARBLED)])
-def test_a_lost_link_stops_the_wheels(reply: bytes, halt: StopReason, line: Line) -> None:
+def test_a_lost_link_stops_the_wheels(reply, halt, line):
     loop = line.control_loop(silence=0.3)
     drive(line, loop, 0.5, 0.1)
     line.mangle, since = lambda _: reply, line.now
     while rolls(line.robot):
         assert line.now - since <= 0.3 + 0.1 + 2 * PERIOD
         drive(line, loop, PERIOD, 0.1)
-    check_stop(loop, halt)
+    assert loop.active_stop.reason is halt
     line.mangle = lambda reply: reply
     drive(line, loop, 0.5, 0.1)
     assert not rolls(line.robot)  # no automatic restart
@@ -200,45 +185,43 @@ def test_a_lost_link_stops_the_wheels(reply: bytes, halt: StopReason, line: Line
     assert rolls(line.robot)
 
 
-def test_an_unplugged_port_is_final(line: Line, loop: ControlLoop) -> None:
+def test_an_unplugged_port_is_final(line, loop):
     drive(line, loop, 0.2, 0.1)
     line.gone = True
     drive(line, loop, 0.2, 0.1)
-    check_stop(loop, StopReason.UNPLUGGED)
+    assert loop.active_stop.reason is StopReason.UNPLUGGED
     with pytest.raises(CommandRefused, match="unplugged"):
         loop.release()
 
 
-@given(
-    st.lists(st.sampled_from(["in time", "late", "behind"]), min_size=1, max_size=30), st.floats(-0.2, 0.2)
-)
-def test_a_late_reply_loses_nothing(fates: list[str], forward: float) -> None:
+FATES = st.lists(st.sampled_from(["in time", "late", "behind"]), min_size=1, max_size=30)
+
+
+@given(FATES, st.floats(-0.2, 0.2))
+def test_a_late_reply_loses_nothing(fates, forward):
     """`late`: the reply arrives before the next query; `behind`: after it, just before the next reply."""
     line = Line()
     loop = line.control_loop(silence=5.0)
-    late, behind = [], []
+    held = {"late": [], "behind": []}
 
-    def mangle(reply: bytes) -> bytes:
+    def mangle(reply):
         fate = fates.pop(0) if fates else "in time"
-        if fate == "late":
-            late.append(reply)
-        if fate == "behind":
-            behind.append(reply)
-        held = b"" if fate != "in time" else b"".join(behind)
-        behind[:] = behind if fate != "in time" else []
-        return held + (reply if fate == "in time" else b"")
+        if fate != "in time":
+            held[fate].append(reply)
+            return b""
+        before, held["behind"] = held["behind"], []
+        return b"".join([*before, reply])
 
     line.mangle = mangle
     while fates:
         drive(line, loop, PERIOD, forward)
-        while late:
-            line.arrive(late.pop(0))
+        line.waiting += b"".join(held.pop("late"))
+        held["late"] = []
     for _ in range(3):
         loop.poll()
     total = loop.take_odometry()
     assert abs(1000 * (total.dx - line.robot.base.travelled)) < 1 + 1e-6
-    assert loop.link.counts.stray == 0
-    assert loop.link.counts.lost == loop.link.counts.late
+    assert (loop.link.counts.stray, loop.link.counts.lost) == (0, loop.link.counts.late)
     assert not loop.gap()
 
 
@@ -252,7 +235,7 @@ def test_garbage_costs_only_the_replies_that_it_damages(noise, forward):
     loop = line.control_loop(silence=5.0)
     pending = [*noise, *[None] * 3]
 
-    def mangle(reply: bytes) -> bytes:
+    def mangle(reply):
         how, data = (pending and pending[0]) or ("before", b"")
         return {"before": data + reply, "instead": data, "cut": reply[: len(data)]}[how]
 
@@ -274,7 +257,7 @@ def test_garbage_costs_only_the_replies_that_it_damages(noise, forward):
 
 @given(st.integers(1, 40), st.sampled_from([b"\xff", b"\0"]), st.floats(-0.2, 0.2))
 @example(4, b"\xff", 0.125)  # noise and a motion of 3 mm look like a reply of full mode
-def test_garbage_before_a_reply_costs_nothing(count: int, noise: bytes, forward: float) -> None:
+def test_garbage_before_a_reply_costs_nothing(count, noise, forward):
     line = Line()
     loop = line.control_loop()
     line.mangle = lambda reply: noise * count + reply
@@ -286,20 +269,15 @@ def test_garbage_before_a_reply_costs_nothing(count: int, noise: bytes, forward:
     assert abs(1000 * (loop.take_odometry().dx - line.robot.base.travelled)) < 1 + 1e-6
 
 
-def test_a_command_given_during_a_read_is_checked(line: Line, loop: ControlLoop) -> None:
+def test_a_command_given_during_a_read_is_checked(line, loop):
     line.robot.touch(protocol.Bumps.RIGHT)
-
-    def mangle(reply: bytes) -> bytes:
-        loop.steer(0.1, 0.0)
-        return reply
-
-    line.mangle = mangle
+    line.mangle = lambda reply: loop.steer(0.1, 0.0) or reply
     loop.poll()
     assert loop.active_stop
     assert not rolls(line.robot)
 
 
-def test_commands_from_before_a_stop_are_dropped(line: Line, loop: ControlLoop) -> None:
+def test_commands_from_before_a_stop_are_dropped(line, loop):
     drive(line, loop, 0.5, 0.1)
     line.robot.touch(protocol.Bumps.RIGHT)
     loop.poll()
@@ -312,10 +290,138 @@ def test_commands_from_before_a_stop_are_dropped(line: Line, loop: ControlLoop) 
     assert loop.active_stop is None
 
 
-def test_a_reply_followed_by_noise_is_rejected(line: Line, loop: ControlLoop) -> None:
+def test_a_reply_followed_by_noise_is_rejected(line, loop):
     drive(line, loop, 0.2, 0.1)
     assert not loop.gap()
-    line.arrive(b"\0\0\0")
+    line.waiting += b"\0\0\0"
     drive(line, loop, 0.2, 0.1)
     assert loop.gap()
     assert not loop.gap()
+
+
+SPEED = st.integers(-protocol.TOP_SPEED, protocol.TOP_SPEED)
+
+
+def awake():
+    robot = EmulatedCreate(CreateEmulatorConfig())
+    assert robot.receive(protocol.START + protocol.SAFE) == []
+    return robot
+
+
+@given(SPEED, SPEED, st.integers(0, 6))
+def test_a_stop_works_after_an_incomplete_command(right, left, length):
+    for command in (protocol.drive(right, left), protocol.QUERY):
+        robot = awake()
+        robot.receive(protocol.drive(200, 200) + command[:length])
+        robot.receive(protocol.STOP_ANYHOW)
+        assert (robot.right, robot.left) == (0, 0)
+
+
+@pytest.mark.parametrize(("right", "left"), [(501, 0), (0, -501), (32767, 0)])
+def test_commands_beyond_the_interface_are_refused(right, left):
+    with pytest.raises(ValueError, match="limit of the Create is 500"):
+        protocol.drive(right, left)
+
+
+@given(SPEED, SPEED, st.floats(0, 3), st.sampled_from([0, 1, 2, 3, 4, 16, 31]))
+def test_valid_replies_are_accepted(right, left, elapsed, bumps):
+    robot = awake()
+    robot.receive(protocol.drive(right, left))
+    robot.touch(protocol.Bumps(bumps))
+    robot.advance(elapsed)
+    (reply,) = robot.receive(protocol.QUERY)
+    found = protocol.SensorReply.parse(reply, elapsed)
+    assert found.bumps == bumps
+    assert found.mode == (protocol.Mode.PASSIVE if bumps > 3 else protocol.Mode.SAFE)
+    assert abs(found.millimetres - 1000 * robot.base.travelled) < 1
+    assert abs(found.degrees - math.degrees(robot.base.turned)) < 1
+
+
+@given(st.binary(max_size=12), st.floats(0, 1))
+@example(protocol.REPLY.pack(0, 0, 0, 2), 0.0)
+@example(protocol.REPLY.pack(60, 0, 0, 2), 0.0)
+@example(protocol.REPLY.pack(0, -60, 0, 2), 0.0)
+@example(protocol.REPLY.pack(0, 0, 32, 2), 0.0)
+@example(protocol.REPLY.pack(0, 0, 0, 0), 0.0)
+@example(protocol.REPLY.pack(0, 0, 0, 4), 0.0)
+def test_accepted_replies_are_possible(data, elapsed):
+    found = protocol.SensorReply.parse(data, elapsed)
+    if found is not None:
+        assert protocol.REPLY.pack(*found) == data
+        assert found.mode in (1, 2, 3)
+        assert abs(found.millimetres) <= 500 * (elapsed + 0.1) + 5
+        assert abs(found.degrees) <= 222 * (elapsed + 0.1) + 5
+    else:
+        assert data != protocol.REPLY.pack(0, 0, 0, 2)
+
+
+@given(st.floats(0.0005, 0.5), st.floats(allow_infinity=True, allow_nan=True), st.floats())
+@example(0.2, 0.2, 0.0)
+@example(0.2004, 0.2004, 0.0)
+@example(0.1996, 0.1996, 0.0)
+@example(0.2, 0.2006, 0.0)
+@example(0.5, 0.0, 3.875)
+def test_wheel_speeds_are_within_the_limit(cap, forward, turn):
+    config = CreateConfig(speed=cap)
+    apart = turn * 0.258 / 2
+    fits = max(abs(forward + apart), abs(forward - apart)) <= cap  # False for NaN
+    try:
+        right, left = config.wheel_speeds(forward, turn)
+    except CommandRefused:
+        assert not fits
+        return
+    assert max(abs(right), abs(left)) <= 1000 * cap + 1e-6
+    assert abs(right - 1000 * (forward + apart)) < 1.001
+    assert abs(left - 1000 * (forward - apart)) < 1.001
+
+
+LEG = st.tuples(SPEED, SPEED, st.floats(0.005, 0.5), st.integers(1, 20))  # wheels, s, readings
+LEGS = st.lists(LEG, min_size=1, max_size=12)
+
+
+def readings(legs):
+    """A robot after some legs, and its readings: mm, degrees, s."""
+    robot, replies = awake(), []
+    for right, left, seconds, count in legs:
+        robot.receive(protocol.drive(right, left))
+        for _ in range(count):
+            robot.advance(seconds)
+            (reply,) = robot.receive(protocol.QUERY)
+            millimetres, degrees, *_ = protocol.REPLY.unpack(reply)
+            replies.append((millimetres, degrees, robot.time))
+    return robot, replies
+
+
+@given(LEGS)
+def test_sums_and_pose_are_accurate_to_the_quantisation(legs):
+    robot, replies = readings(legs)
+    assert abs(sum(m for m, _, _ in replies) - 1000 * robot.base.travelled) < 1 + 1e-6
+    assert abs(sum(d for _, d, _ in replies) - math.degrees(robot.base.turned)) < 1 + 1e-6
+    odometer = CreateOdometry(0.0)
+    for reading in replies:
+        odometer.add(*reading)
+    dx, dy, dtheta, dt = odometer.take_odometry()
+    driven = sum(abs(right + left) / 2000 * s * n for right, left, s, n in legs)
+    turned = math.radians(sum(abs(d) for _, d, _ in replies))
+    # Headings err by at most a degree; a millimetre is reported late, in another direction.
+    bound = driven * math.radians(1) + 1e-3 * (1 + turned)
+    assert math.hypot(dx - robot.base.x, dy - robot.base.y) <= bound + 1e-9
+    assert abs(dtheta - robot.base.heading) < math.radians(1) + 1e-9
+    assert dt == pytest.approx(robot.time)
+
+
+@given(LEGS, st.lists(st.booleans(), min_size=240, max_size=240))
+def test_odometry_read_in_parts_is_the_same(legs, taken):
+    _, replies = readings(legs)
+    whole, parts = CreateOdometry(0.0), CreateOdometry(0.0)
+    pose, time = np.zeros(3), 0.0
+    for k, reading in enumerate(replies):
+        whole.add(*reading)
+        parts.add(*reading)
+        if taken[k] or reading is replies[-1]:
+            *motion, dt = parts.take_odometry()
+            pose, time = compose(pose, np.array(motion)), time + dt
+    total = whole.take_odometry()
+    assert pose[:2] == pytest.approx(total[:2], abs=1e-9)
+    assert math.cos(pose[2] - total.dtheta) == pytest.approx(1)
+    assert time == pytest.approx(total.dt)

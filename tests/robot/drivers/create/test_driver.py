@@ -1,7 +1,5 @@
 """The driver against the emulator on a terminal: threads, processes and time are real."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -9,10 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from contextlib import closing, contextmanager
 
 import pytest
 
@@ -30,39 +25,34 @@ import serial
 class Emulated:
     """A process of the emulator; its port keeps its name when it is plugged in again."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.path = str(folder / "create.tty")
         words = [sys.executable, "-m", "robot.emulators.create", "--config", json.dumps({"port": self.path})]
-        self.process = subprocess.Popen(
-            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
-        )
-        assert self.process.stdout
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, bufsize=1)
         assert self.process.stdout.readline().split()[0] == self.path
 
-    def do(self, what: str, **more: Any) -> Any:
-        assert self.process.stdin
-        assert self.process.stdout
+    def do(self, what, **more):
         self.process.stdin.write(json.dumps({"do": what, **more}) + "\n")
         return json.loads(self.process.stdout.readline())
 
-    def wheels(self) -> list[int]:
+    def wheels(self):
         """Speeds of the wheels, right and left, mm/s."""
         return self.do("state")["wheels"]
 
-    def close(self) -> None:
+    def close(self):
         self.process.kill()
         self.process.communicate()
 
 
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulated]:
-    robot = Emulated(tmp_path_factory.mktemp("create"))
-    yield robot
-    robot.close()
+def robot(tmp_path_factory):
+    with closing(Emulated(tmp_path_factory.mktemp("create"))) as robot:
+        yield robot
 
 
 @pytest.fixture
-def emulated(robot: Emulated) -> Emulated:
+def emulated(robot):
     """An emulated Create without faults, for drivers that end in order."""
     for request in ("plug", "clear"):
         robot.do(request)
@@ -71,48 +61,41 @@ def emulated(robot: Emulated) -> Emulated:
 
 
 @pytest.fixture
-def alone(tmp_path: Path) -> Iterator[Emulated]:
+def alone(tmp_path):
     """An emulated Create of its own, for drivers whose process is killed or loses the port."""
-    robot = Emulated(tmp_path)
-    yield robot
-    robot.close()
+    with closing(Emulated(tmp_path)) as robot:
+        yield robot
 
 
-def create(emulated: Emulated, **settings: float) -> CreateDriver:
+def create(emulated, **settings):
     """A driver with longer time limits than usual, since the machine may be busy. Its watchdog does not wait
     for a disconnected port."""
     usual = {"silence": 5.0, "patience": 5.0, "replug": 0.01}
     return CreateDriver(CreateConfig(port=emulated.path, **{**usual, **settings}))
 
 
-def drive_for(driver: CreateDriver, seconds: float, forward: float, turn: float = 0.0) -> None:
+def drive_for(driver, seconds, forward, turn=0.0):
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         driver.drive(forward, turn)
         time.sleep(0.05)
 
 
-def drive_and_poll(driver: CreateDriver) -> None:
-    """Drives until two more replies are good or lost."""
-    before = driver.counts.good + driver.counts.lost
-    until(lambda: driver.drive(0.1, 0.0) or driver.counts.good + driver.counts.lost >= before + 2)
-
-
-def stop_reason(driver: CreateDriver) -> StopReason:
-    return until(lambda: driver.active_stop).reason
-
-
-def stop_and_read(driver: CreateDriver) -> None:
+def stop_and_read(driver):
     """Stops and reads the last millimetres."""
     driver.stop()
     good = driver.counts.good
     until(lambda: driver.counts.good > good + 1)
 
 
-def test_turns_are_measured_to_the_degree(emulated: Emulated) -> None:
-    """At either end; test_protocol.py limits it to one degree in all."""
+def test_ways_and_turns_are_measured_though_replies_arrive_in_pieces(emulated):
+    """To the millimetre, and the degree at either end; test_control_loop.py limits it to one in all."""
     before = emulated.do("state")
     with create(emulated) as driver:
+        emulated.do("trickle", seconds=0.004)
+        drive_for(driver, 0.8, 0.2)
+        stop_and_read(driver)
+        straight, way = driver.odometry(), emulated.do("state")["travelled"] - before["travelled"]
         total = 0.0
         for forward, turn in ((0.15, 0.0), (0.1, 0.5), (0.0, -0.8), (-0.1, 0.0)):
             drive_for(driver, 0.4, forward, turn)
@@ -121,30 +104,20 @@ def test_turns_are_measured_to_the_degree(emulated: Emulated) -> None:
         total += driver.odometry().dtheta
         truth = emulated.do("state")
         assert driver.active_stop is None
+    assert straight.dx == pytest.approx(way, abs=2e-3)
+    assert straight.dy == straight.dtheta == 0
+    assert way > 0.1
+    assert straight.dt > 0.8
     assert abs(total - truth["turned"] + before["turned"]) < math.radians(2)
     assert truth["unknown"] <= before["unknown"] + 8  # zero bytes of `STOP_ANYHOW`, of two drivers
     assert emulated.do("state")["mode"] == "PASSIVE"
 
 
-def test_a_straight_line_is_measured_to_the_millimetre_though_replies_arrive_in_pieces(emulated):
-    before = emulated.do("state")["travelled"]
-    with create(emulated) as driver:
-        emulated.do("trickle", seconds=0.004)
-        drive_for(driver, 0.8, 0.2)
-        stop_and_read(driver)
-        odometry = driver.odometry()
-        truth = emulated.do("state")["travelled"] - before
-    assert abs(odometry.dx - truth) < 2e-3
-    assert odometry.dy == odometry.dtheta == 0
-    assert truth > 0.1
-    assert odometry.dt > 0.8
-
-
-def test_the_robot_stops_at_a_bump_and_without_further_commands(emulated: Emulated) -> None:
+def test_the_robot_stops_at_a_bump_and_without_further_commands(emulated):
     with create(emulated, patience=2.0) as driver:
         drive_for(driver, 0.2, 0.1)
         emulated.do("bump")
-        assert stop_reason(driver) is StopReason.BUMPED
+        assert until(lambda: driver.active_stop).reason is StopReason.BUMPED
         until(lambda: emulated.wheels() == [0, 0])
         with pytest.raises(CommandRefused, match="bumped"):
             driver.drive(0.1, 0.0)
@@ -154,12 +127,13 @@ def test_the_robot_stops_at_a_bump_and_without_further_commands(emulated: Emulat
         assert driver.active_stop is None
 
 
-def test_driving_continues_after_garbage_and_cut_replies(emulated: Emulated) -> None:
+def test_driving_continues_after_garbage_and_cut_replies(emulated):
     before = emulated.do("state")["travelled"]
     with create(emulated) as driver:
         for count in range(12):
             emulated.do("cut" if count % 2 else "garbage", bytes=count // 2 if count % 2 else 3 * count + 1)
-            drive_and_poll(driver)
+            polled = driver.counts.good + driver.counts.lost
+            until(lambda n=polled + 2: driver.drive(0.1, 0.0) or driver.counts.good + driver.counts.lost >= n)
         stop_and_read(driver)
         odometry, truth, counts = driver.odometry(), emulated.do("state")["travelled"], driver.counts
         assert driver.active_stop is None
@@ -169,17 +143,17 @@ def test_driving_continues_after_garbage_and_cut_replies(emulated: Emulated) -> 
     assert odometry.dx <= truth - before + 2e-3  # test_control_loop.py limits the difference
 
 
-def test_switching_off_and_unplugging_stop_a_driving_robot(emulated: Emulated) -> None:
+def test_switching_off_and_unplugging_stop_a_driving_robot(emulated):
     with create(emulated, silence=1.0) as driver:
         drive_for(driver, 0.2, 0.1)
         emulated.do("off")
-        assert stop_reason(driver) is StopReason.SILENT
+        assert until(lambda: driver.active_stop).reason is StopReason.SILENT
     driver = create(emulated)
     driver.start()
     try:
         drive_for(driver, 0.2, 0.1)
         emulated.do("unplug")
-        assert stop_reason(driver) is StopReason.UNPLUGGED
+        assert until(lambda: driver.active_stop).reason is StopReason.UNPLUGGED
         with pytest.raises(CommandRefused, match="unplugged"):
             driver.drive(0.1, 0.0)
         driver.stop()
@@ -192,11 +166,11 @@ def test_switching_off_and_unplugging_stop_a_driving_robot(emulated: Emulated) -
 
 
 @pytest.mark.parametrize("how", [signal.SIGSTOP, signal.SIGKILL])
-def test_the_robot_stops_when_the_watchdog_hangs_or_ends(emulated: Emulated, how: int) -> None:
+def test_the_robot_stops_when_the_watchdog_hangs_or_ends(emulated, how):
     with create(emulated, patience=1.0) as driver:
         until(lambda: driver.drive(0.1, 0.0) or emulated.wheels() == [100, 100])
         os.kill(driver.watchdog.pid, how)
-        assert stop_reason(driver) is StopReason.UNGUARDED
+        assert until(lambda: driver.active_stop).reason is StopReason.UNGUARDED
         until(lambda: emulated.wheels() == [0, 0])
 
 
@@ -229,7 +203,7 @@ SerialLink.send = send_and_hang
 
 
 @contextmanager
-def driving(alone: Emulated, code: str = DRIVES) -> Iterator[subprocess.Popen[bytes]]:
+def driving(alone, code=DRIVES):
     """A program that drives the robot, once it does."""
     program = subprocess.Popen([sys.executable, "-c", code, alone.path])
     try:
@@ -241,7 +215,7 @@ def driving(alone: Emulated, code: str = DRIVES) -> Iterator[subprocess.Popen[by
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_a_rolling_robot_is_stopped_when_its_port_returns(alone: Emulated, killed: bool) -> None:
+def test_a_rolling_robot_is_stopped_when_its_port_returns(alone, killed):
     """By the watchdog process: the driver, or the program that it runs in, has ended."""
     with driving(alone) as program:
         alone.do("unplug")
@@ -256,7 +230,7 @@ def test_a_rolling_robot_is_stopped_when_its_port_returns(alone: Emulated, kille
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_the_watchdog_stops_a_killed_or_hanging_program(alone: Emulated, how: int) -> None:
+def test_the_watchdog_stops_a_killed_or_hanging_program(alone, how):
     with driving(alone) as program:
         os.kill(program.pid, how)
         until(lambda: alone.wheels() == [0, 0])
@@ -265,12 +239,12 @@ def test_the_watchdog_stops_a_killed_or_hanging_program(alone: Emulated, how: in
         assert len(alone.do("state")["drives"]) == drives  # one stop, by the watchdog
 
 
-def test_a_program_that_hangs_right_after_its_first_command_is_stopped(alone: Emulated) -> None:
+def test_a_program_that_hangs_right_after_its_first_command_is_stopped(alone):
     with driving(alone, HANGS + DRIVES):
         until(lambda: alone.wheels() == [0, 0])
 
 
-def test_ports_without_a_create_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ports_without_a_create_are_refused(monkeypatch):
     master, slave = os.openpty()
     try:
         for port, refusal, match in (
@@ -288,7 +262,7 @@ def test_ports_without_a_create_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
         CreateDriver(CreateConfig(port="/dev/ttyUSB0")).start()
 
 
-def test_a_second_program_is_refused(emulated: Emulated) -> None:
+def test_a_second_program_and_a_lifted_robot_are_refused(emulated):
     with create(emulated) as driver:
         with pytest.raises(NoPort, match="another program"):
             CreateDriver(CreateConfig(port=emulated.path)).start()
@@ -296,15 +270,12 @@ def test_a_second_program_is_refused(emulated: Emulated) -> None:
         assert driver.active_stop is None
     with create(emulated) as driver:  # the port is free again
         assert driver.active_stop is None
-
-
-def test_a_lifted_robot_is_not_started(emulated: Emulated) -> None:
     emulated.do("drop")
     with pytest.raises(NotSafe, match="set it on all its wheels"):
         create(emulated).start()
 
 
-def test_the_emulator_requires_its_baud_rate_and_known_requests(alone: Emulated) -> None:
+def test_the_emulator_requires_its_baud_rate_and_known_requests(alone):
     assert "error" in alone.do("dance")
     assert "error" in alone.do("garbage")
     assert alone.do("state")["mode"] == "OFF"

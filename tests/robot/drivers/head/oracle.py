@@ -1,12 +1,8 @@
-"""A reference decoder after the definitions of `DecoderCounts`, byte by byte, and streams with damage, from
-hypothesis or a seed."""
-
-from __future__ import annotations
+"""A reference decoder after the definitions of `DecoderCounts`, byte by byte, and streams with damage."""
 
 import struct
 import zlib
-from random import Random
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 from hypothesis import strategies as st
@@ -14,44 +10,32 @@ from hypothesis import strategies as st
 from robot.drivers.head.usb_protocol import pack_frames
 
 LATE = 4096
-
-
-class Sample(NamedTuple):
-    sequence: int
-    time: int
-    flags: int
-    values: tuple[int, ...]
-
-
-class Decoded(NamedTuple):
-    """The samples of a stream, its counts in the order of `DecoderCounts`, the number of undecided bytes."""
-
-    samples: list[Sample]
-    counts: tuple[int, ...]
-    pending: int
+Sample = namedtuple("Sample", "sequence time flags values")
+Decoded = namedtuple("Decoded", "samples counts pending")
+"""The samples of a stream, its counts in the order of `DecoderCounts`, the number of undecided bytes."""
 
 
 class Stream:
     """Frame numbers accepted since the last restart of a head."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number):
         self.first = self.highest = number
         self.numbers = {number}
 
-    def add(self, number: int) -> None:
+    def add(self, number):
         self.numbers.add(number)
         self.highest = max(self.highest, number)
 
     @property
-    def missing(self) -> int:
+    def missing(self):
         return self.highest - self.first + 1 - len(self.numbers)
 
 
-def decode_reference(data: bytes, whiskers: int, channels: int) -> Decoded:
+def decode_reference(data, whiskers, channels):
     """The correct result for these bytes; it does not depend on the pieces in which they arrive."""
     body = 16 + 2 * whiskers * channels
-    samples: list[Sample] = []
-    streams: list[Stream] = []
+    samples = []
+    streams = []
     bad = skipped = overruns = duplicates = place = 0
     time = None
     while place < len(data):
@@ -72,12 +56,9 @@ def decode_reference(data: bytes, whiskers: int, channels: int) -> Decoded:
             duplicates += 1
             continue
         # The candidate nearest to the previous time; of two at the same distance, the earlier.
-        if time is None:
-            time = stamp
-        else:
-            wraps = (time - stamp) // 2**32
-            before = time
-            time = min((stamp + 2**32 * (wraps + k) for k in (0, 1)), key=lambda t: (abs(t - before), t))
+        before = stamp if time is None else time
+        wraps = (before - stamp) // 2**32
+        time = min((stamp + 2**32 * (wraps + k) for k in (0, 1)), key=lambda t: (abs(t - before), t))
         overruns += flags & 1
         samples.append(Sample(full, time, flags, struct.unpack(f"<{whiskers * channels}h", here[16:body])))
     missing = sum(stream.missing for stream in streams)
@@ -85,7 +66,7 @@ def decode_reference(data: bytes, whiskers: int, channels: int) -> Decoded:
     return Decoded(samples, counts, len(data) - place)
 
 
-def accept_number(number: int, streams: list[Stream]) -> int | None:
+def accept_number(number, streams):
     """Adds a new frame number to the last stream; returns it unwrapped, or None for a duplicate."""
     if not streams:
         streams.append(Stream(number))
@@ -110,30 +91,30 @@ GARBAGE = (b"", b"\0", b"W", b"WH", b"WHK", b"WHK1", b"WHK1WHK1", b"WHKC", b"1",
 class Head:
     """A source of frames with consecutive numbers and times."""
 
-    def __init__(self, whiskers: int, channels: int, sequence: int, time: int, seed: int = 0) -> None:
+    def __init__(self, whiskers, channels, sequence, time, seed=0):
         self.shape = whiskers, channels
         self.sequence, self.time = sequence, time
-        self.sent: list[bytes] = []
+        self.sent = []
         self.random = np.random.default_rng(seed)
 
-    def frame(self, ahead: int = 1, later: int = 500, flags: int = 0) -> bytes:
+    def frame(self, ahead=1, later=500, flags=0):
         self.sequence += ahead
         self.time += later
         values = self.random.integers(-32768, 32768, (1, *self.shape)).astype(np.int16)
         self.sent.append(pack_frames([self.sequence], [self.time], [flags], values))
         return self.sent[-1]
 
-    def foreign(self, field: int, value: int) -> bytes:
+    def foreign(self, field, value):
         """A frame of another head with a valid CRC; `field` 0 changes whiskers, 1 channels, 2 version."""
         body = bytearray(self.frame()[:-4])
         body[13 + field] = value
         return bytes(body) + struct.pack("<I", zlib.crc32(body))
 
-    def repeat(self, back: int) -> bytes:
+    def repeat(self, back):
         return self.sent[-1 - back % len(self.sent)] if self.sent else b""
 
 
-def flip_bits(frame: bytes, place: int, mask: int) -> bytes:
+def flip_bits(frame, place, mask):
     data = bytearray(frame)
     data[place % len(data)] ^= mask
     return bytes(data)
@@ -144,11 +125,11 @@ BACKS = (0, 1, 2, 5, 30, 4094, 4095, 4096, 4097, 2**31)
 TIMES = (-(2**31), -1, 2**31 - 1, 2**31, 2**32 - 1)
 
 
-def frames(head: Head, count: int) -> bytes:
+def frames(head, count):
     return b"".join(head.frame(flags=k & 15) for k in range(count))
 
 
-def event(head: Head, random: Random) -> bytes:
+def event(head, random):
     """The bytes on the wire of an event."""
     number = random.randrange(201)
     events = (
@@ -168,7 +149,7 @@ def event(head: Head, random: Random) -> bytes:
 
 
 @st.composite
-def streams(draw: st.DrawFn) -> tuple[bytes, list[int], tuple[int, int]]:
+def streams(draw):
     """Bytes of a stream, cut positions, and shape (whiskers, channels) of its head."""
     shape = draw(st.sampled_from([(2, 1), (1, 3), (18, 3)]))
     start = draw(st.sampled_from([0, 1, 4000, 2**31, 2**32 - 60, 2**32 - 1]))
@@ -178,7 +159,7 @@ def streams(draw: st.DrawFn) -> tuple[bytes, list[int], tuple[int, int]]:
     return data, sorted(draw(st.lists(st.integers(0, len(data)), max_size=12))), shape
 
 
-def damaged_stream(random: Random, size: int) -> bytes:
+def damaged_stream(random, size):
     """A long stream with an event after about every sixtieth frame."""
     head, data = Head(18, 3, 2**32 - 5000, 2**32 - 10**6), bytearray()
     while len(data) < size:

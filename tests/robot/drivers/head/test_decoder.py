@@ -1,11 +1,14 @@
-"""Frames, commands and counts of a head; the decoder agrees with `oracle.py` for damaged streams."""
+"""Frames, commands, counts of a head, damaged or not, against `oracle.py`; the USB bridge and its errors."""
 
-from __future__ import annotations
-
+import errno
 import itertools
 import struct
+import sys
 import zlib
+from array import array
+from contextlib import nullcontext
 from random import Random
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -14,9 +17,21 @@ from hypothesis import strategies as st
 
 from robot.drivers.head import decoder as decoding
 from robot.drivers.head import usb_protocol as wire
-from robot.drivers.head.decoder import Decoder, DecoderCounts, Frames, SequenceUnwrapper
-from robot.drivers.head.usb_protocol import Command, pack_frames
+from robot.drivers.head.decoder import Decoder, DecoderCounts, SequenceUnwrapper
+from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled, open_bridge
+from robot.drivers.head.driver_config import Address, HeadLinkConfig
+from robot.drivers.head.usb_protocol import (
+    ENDPOINT_IN,
+    ENDPOINT_OUT,
+    REQUEST_IN,
+    REQUEST_OUT,
+    Command,
+    Request,
+    pack_frames,
+)
+from tactile.base.errors import InputError
 from tests.robot.drivers.head import oracle
+from tests.robot.drivers.head.memory import MemoryHead
 from tests.robot.drivers.head.oracle import Sample, damaged_stream, decode_reference, flip_bits, streams
 
 INT16 = st.integers(-32768, 32767)
@@ -28,16 +43,15 @@ ARRIVALS = st.tuples(
 """The first number, the steps from each to the next, and where the numbers are cut into blocks."""
 
 
-def samples(frames: Frames) -> list[Sample]:
+def samples(frames):
     columns = zip(frames.sequence, frames.time, frames.flags, frames.values, strict=True)
     return [Sample(int(n), int(t), int(f), tuple(v.ravel().tolist())) for n, t, f, v in columns]
 
 
-def stream(count: int, first: int = 0) -> tuple[bytes, np.ndarray]:
-    """Frames in order, 500 us apart, and their values."""
-    values = np.random.default_rng(first).integers(-32768, 32768, (count, 18, 3)).astype(np.int16)
+def stream(count, first=0):
+    """Frames in order, 500 us apart."""
     number = first + np.arange(count)
-    return pack_frames(number, 500 * number, np.zeros(count), values), values
+    return pack_frames(number, 500 * number, np.zeros(count), np.full((count, 18, 3), 7, np.int16))
 
 
 def check_prefixes(drawn):
@@ -48,23 +62,13 @@ def check_prefixes(drawn):
         expected = decode_reference(data[:end], *shape)
         assert (got, decoder.pending) == (expected.samples, expected.pending)
         assert decoder.counts == DecoderCounts(*expected.counts)
-        whole = decoder.counts.good + decoder.counts.duplicates
-        assert (
-            end == wire.frame_dtype(*shape).itemsize * whole + decoder.counts.skipped_bytes + decoder.pending
-        )
+        whole = (decoder.counts.good + decoder.counts.duplicates) * wire.frame_dtype(*shape).itemsize
+        assert whole + decoder.counts.skipped_bytes + decoder.pending == end
 
 
-@settings(max_examples=150)
-@given(streams())
-def test_every_prefix_agrees_with_the_reference_decoder(drawn):
-    check_prefixes(drawn)
-
-
-@pytest.mark.soak
-@settings(max_examples=3000)
-@given(streams())
-def test_every_prefix_of_many_streams_agrees_with_the_reference_decoder(drawn):
-    check_prefixes(drawn)
+@pytest.mark.parametrize("examples", [150, pytest.param(3000, marks=pytest.mark.soak)])
+def test_every_prefix_agrees_with_the_reference_decoder(examples):
+    settings(max_examples=examples)(given(streams())(check_prefixes))()
 
 
 @pytest.mark.parametrize("size", [300_000, pytest.param(10_000_000, marks=pytest.mark.soak)])
@@ -77,38 +81,25 @@ def test_a_long_stream_in_random_pieces(size):
         got += samples(decoder.feed(data[place : place + step]))
         place += step
     expected = decode_reference(data, 18, 3)
-    assert decoder.counts == DecoderCounts(*expected.counts)
-    assert got == expected.samples
-
-
-def test_a_clean_stream_is_decoded_completely():
-    data, values = stream(3000, first=2**32 - 1500)
-    decoder = Decoder(18)
-    parts = [decoder.feed(data[k : k + 4096]) for k in range(0, len(data), 4096)]
-    frames = Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    np.testing.assert_array_equal(frames.sequence, 2**32 - 1500 + np.arange(3000))
-    assert (np.diff(frames.time) == 500).all()
-    np.testing.assert_array_equal(frames.values, values)
-    assert [column.dtype for column in frames] == [np.int64, np.int64, np.uint8, np.int16]
-    assert decoder.counts == DecoderCounts(good=3000)
+    assert (decoder.counts, got) == (DecoderCounts(*expected.counts), expected.samples)
 
 
 def test_a_damaged_or_cut_frame_costs_no_other_frame():
-    data, _ = stream(9)
+    data = stream(9)
     before, frame, after = data[: 4 * 128], data[4 * 128 : 5 * 128], data[5 * 128 :]
     for place, mask in itertools.product(range(128), (1, 0x80, 0xFF)):
         decoder = Decoder(18)
         frames = decoder.feed(before + flip_bits(frame, place, mask) + after)
-        assert frames.sequence.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
-        assert decoder.counts.missing == 1
+        assert (frames.sequence.tolist(), decoder.counts.missing) == ([0, 1, 2, 3, 5, 6, 7, 8], 1)
         assert decoder.counts.bad == (place >= 4)  # a damaged magic is no frame start
+    assert [column.dtype for column in frames] == [np.int64, np.int64, np.uint8, np.int16]
     for start, end in itertools.combinations(range(0, 128, 3), 2):
         frames = Decoder(18).feed(before + frame[:start] + frame[end:] + after)
         assert frames.sequence.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
 
 
-def test_numbers_are_unique_over_streams():
-    data, _ = stream(50)
+def test_after_a_restart_numbers_are_new_and_times_follow_the_device_clock():
+    data = stream(50)
     decoder, got = Decoder(18), []
     for _ in range(3):
         got += decoder.feed(data[:-30]).sequence.tolist()
@@ -116,11 +107,7 @@ def test_numbers_are_unique_over_streams():
     assert got == sorted(set(got))
     assert [n % 2**32 for n in got] == 3 * list(range(49))
     assert decoder.counts == DecoderCounts(good=147, skipped_bytes=3 * 98, restarts=2)
-
-
-def test_times_after_a_restart_follow_the_device_clock():
-    data, _ = stream(4, first=2**33 // 500)
-    decoder = Decoder(18)
+    data = stream(4, first=2**33 // 500)
     for clock in (3 * 2**32 - 7, 3 * 2**32 + 10**6):
         decoder.restart(clock)
         frames = decoder.feed(data)
@@ -137,15 +124,6 @@ def test_decoding_time_is_linear_for_hostile_bytes(monkeypatch):
     assert 19_000 < len(calls) <= 20_000
 
 
-@pytest.fixture(scope="module")
-def few():
-    """A small range of late numbers, so that all orders of arrival occur."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(decoding, "LATE", 8)
-        patch.setattr(oracle, "LATE", 8)
-        yield
-
-
 def check_arrivals(drawn):
     first, steps, cuts = drawn
     raw = [(first + step) % 2**32 for step in itertools.accumulate(steps)]
@@ -154,21 +132,15 @@ def check_arrivals(drawn):
         number, new = mine.take(block)
         full = [oracle.accept_number(value, streams) for value in block.tolist()]
         assert [n if taken else None for n, taken in zip(number.tolist(), new.tolist(), strict=True)] == full
-        assert mine.missing == sum(stream.missing for stream in streams)
-        assert mine.streams == len(streams)
+        assert (mine.missing, mine.streams) == (sum(stream.missing for stream in streams), len(streams))
 
 
-@settings(max_examples=250)
-@given(ARRIVALS)
-def test_all_orders_of_arrival(few, drawn):
-    check_arrivals(drawn)
-
-
-@pytest.mark.soak
-@settings(max_examples=5000)
-@given(ARRIVALS)
-def test_many_orders_of_arrival(few, drawn):
-    check_arrivals(drawn)
+@pytest.mark.parametrize("examples", [250, pytest.param(5000, marks=pytest.mark.soak)])
+def test_all_orders_of_arrival(examples, monkeypatch):
+    """With a small range of late numbers, so that all of them occur."""
+    for module in (decoding, oracle):
+        monkeypatch.setattr(module, "LATE", 8)
+    settings(max_examples=examples)(given(ARRIVALS)(check_arrivals))()
 
 
 def test_frame_layout():
@@ -179,15 +151,12 @@ def test_frame_layout():
     assert len(frame) == wire.frame_dtype(18).itemsize == 128
 
 
-@given(
-    st.sampled_from(wire.CommandKind),
-    st.sampled_from(wire.FeedbackMode),
-    st.tuples(*[FLOAT] * 5),
-    st.lists(INT16, max_size=255),
-    st.data(),
-)
-def test_commands_round_trip_and_damaged_ones_are_refused(kind, mode, drive, numbers, data):
-    sent = Command(kind, mode, *drive, np.array(numbers, np.int16))
+KINDS = st.tuples(st.sampled_from(wire.CommandKind), st.sampled_from(wire.FeedbackMode), *[FLOAT] * 5)
+
+
+@given(KINDS, st.lists(INT16, max_size=255), st.data())
+def test_commands_round_trip_and_damaged_ones_are_refused(drive, numbers, data):
+    sent = Command(*drive, np.array(numbers, np.int16))
     packet = bytearray(sent.pack())
     assert len(packet) == 32 + 2 * len(numbers)
     got = Command.unpack(bytes(packet))
@@ -215,11 +184,106 @@ def test_counts_round_trip_exactly(values):
 
 
 def test_counts_are_clipped_to_int16():
-    assert wire.to_counts([-4.0, -np.pi, 0.0, wire.ANGLE, np.pi, 4.0]).tolist() == [
-        -32768,
-        -32768,
-        0,
-        1,
-        32767,
-        32767,
+    counts = wire.to_counts([-4.0, -np.pi, 0.0, wire.ANGLE, np.pi, 4.0])
+    assert counts.tolist() == [-32768, -32768, 0, 1, 32767, 32767]
+
+
+usb = pytest.importorskip("usb.core", reason="pyusb is not installed")
+
+
+@pytest.fixture
+def device(monkeypatch):
+    """A pyusb device whose transfers succeed."""
+    import usb.util
+
+    monkeypatch.setattr(usb.util, "claim_interface", lambda device, number: None)
+    device = Mock()
+    device.read.return_value = array("B", b"abc")
+    device.ctrl_transfer.side_effect = lambda kind, *_: array("B", bytes(8)) if kind == REQUEST_IN else 0
+    return device
+
+
+def test_transfers(device):
+    bridge = Bridge(device, "usb:here")
+    assert bridge.read(4096, 0.02) == b"abc"
+    bridge.write(b"command")
+    assert bridge.request(Request.CLOCK) == bytes(8)
+    assert bridge.request(Request.START) == b""
+    assert device.mock_calls == [
+        call.get_active_configuration(),  # a configured device is not configured again
+        call.read(ENDPOINT_IN, 4096, 20),
+        call.write(ENDPOINT_OUT, b"command", 500),
+        call.ctrl_transfer(REQUEST_IN, Request.CLOCK, 0, 0, 8, 500),
+        call.ctrl_transfer(REQUEST_OUT, Request.START, 0, 0, b"", 500),
     ]
+    device.get_active_configuration.side_effect = usb.USBError("none", None, errno.ENOENT)
+    Bridge(device, "here")
+    device.set_configuration.assert_called_once_with()
+
+
+ERRORS = {
+    Stalled: ("ETIMEDOUT", "EPIPE", "EOVERFLOW"),
+    Disconnected: ("ENODEV", "EIO", "ENOENT", "ENXIO", "ESHUTDOWN", "EPROTO"),
+    InputError: ("EACCES", "EBUSY"),
+}
+
+
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in ERRORS for name in ERRORS[kind]])
+def test_translation_of_usb_errors(device, kind, name):
+    """A read that times out has read nothing; a command or request has failed."""
+    bridge, number, late = Bridge(device, "usb:here"), getattr(errno, name), name == "ETIMEDOUT"
+    error = (usb.USBTimeoutError if late else usb.USBError)("as libusb says", None, number)
+    for transfer in (device.read, device.write, device.ctrl_transfer):
+        transfer.side_effect = error
+    for refused, action in (
+        (not late, lambda: bridge.read(4096, 0.02)),
+        (True, lambda: bridge.write(b"x")),
+        (True, lambda: bridge.request(Request.START)),
+    ):
+        with pytest.raises(kind) if refused else nullcontext():
+            assert action() == b""
+    cleared = [ENDPOINT_IN, ENDPOINT_OUT] if kind is Stalled and not late else []
+    assert device.clear_halt.mock_calls == [call(endpoint) for endpoint in cleared]
+
+
+def test_addresses():
+    for text, address in (
+        ("usb", Address()),
+        ("usb:1d50:60a1", Address(0x1D50, 0x60A1)),
+        ("usb:1D50:60a1:A-7", Address(0x1D50, 0x60A1, "A-7")),
+        ("127.0.0.11", Address(host="127.0.0.11")),
+        ("head.lab:31000", Address(host="head.lab", port=31000)),
+    ):
+        assert Address.parse(text) == Address.parse(str(address)) == address
+        assert HeadLinkConfig(address=text).address == text
+    for text in ("", "usb:", "usb:12:34", "usb:1209:0001:", "host:port", "host:70000", "a b", "usbx"):
+        with pytest.raises(ValueError, match="not an address of a head"):
+            HeadLinkConfig(address=text)
+
+
+def test_no_head_at_an_address():
+    with pytest.raises(Disconnected, match=r"127\.0\.0\.1:9"):
+        open_bridge("127.0.0.1:9")
+    with pytest.raises((Disconnected, InputError)):  # with a real libusb: no head or no permission
+        open_bridge("usb:1209:0001:there-is-none")
+
+
+def test_the_error_for_a_missing_library_has_a_cure(monkeypatch):
+    from usb.backend import libusb1
+
+    monkeypatch.setattr(libusb1, "get_backend", lambda find_library=None: None)
+    with pytest.raises(InputError, match="libusb-package"):
+        open_bridge("usb")
+    monkeypatch.setitem(sys.modules, "usb", None)
+    monkeypatch.setitem(sys.modules, "usb.core", None)
+    with pytest.raises(InputError, match=r"ratslam\[live\]"):
+        open_bridge("usb")
+
+
+def test_identities():
+    bridge = MemoryHead(18)
+    assert HeadIdentity.read(bridge) == HeadIdentity("memory", "1", 18, 3, 2000.0)
+    for wrong in (b"", b"[]", b"{}", b'{"name": 1', b'{"name":"","version":"","whiskers":null}'):
+        bridge.request = lambda request, wrong=wrong: wrong
+        with pytest.raises(InputError, match="identity"):
+            HeadIdentity.read(bridge)

@@ -1,18 +1,12 @@
-"""An emulated head over the real pyusb: transfers, time-outs, stalls and unplugging as over USB, and the
-reader on it."""
-
-from __future__ import annotations
+"""An emulated head over the real pyusb: time-outs, stalls, unplugging as over USB, and the reader on it."""
 
 import errno
 import importlib
 import os
 import signal
-import threading
 import time
-from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,53 +32,51 @@ HEAD = ur10_head(HeadConfig())
 
 
 @pytest.fixture(scope="module")
-def process(loopback: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Faults]:
+def process(loopback, tmp_path_factory):
     config = HeadEmulatorConfig(host=loopback, fifo=1 << 16)
     with running(config, tmp_path_factory.mktemp("head")) as head:
         yield head
 
 
 @pytest.fixture
-def head(process: Faults) -> Faults:
+def head(process):
     """A connected head without faults."""
     process(do="plug")
     return process
 
 
-def find_device(head: Faults) -> Any:
+def find_device(head):
     return core.find(backend=SocketBackend(head.host, PORT), idVendor=wire.VENDOR, idProduct=wire.PRODUCT)
 
 
 @pytest.fixture
-def device(head: Faults) -> Iterator[Any]:
+def device(head):
     one = find_device(head)
     one.get_active_configuration()
-    try:
-        yield one
-    finally:
-        util.dispose_resources(one)
+    yield one
+    util.dispose_resources(one)
 
 
 @contextmanager
-def usb_error(number: int) -> Iterator[None]:
+def usb_error(number):
     """Checks that pyusb raises the error of this number."""
     with pytest.raises(core.USBError) as caught:
         yield
     assert caught.value.errno == number
 
 
-def start(device: Any) -> None:
+def start(device):
     device.ctrl_transfer(wire.REQUEST_OUT, Request.START, 0, 0, b"", 30_000)
 
 
-def read(device: Any, count: int, decoder: Decoder) -> None:
+def read(device, count, decoder):
     """Reads 4 KiB at a time until there are `count` more frames."""
     count += decoder.counts.good
     while decoder.counts.good < count:
         decoder.feed(device.read(ENDPOINT_IN, 4096, 30_000).tobytes())
 
 
-def test_the_device_is_found_with_its_descriptors(head: Faults, device: Any) -> None:
+def test_the_device_is_found_with_its_descriptors(head, device):
     assert (device.idVendor, device.idProduct, device.speed) == (wire.VENDOR, wire.PRODUCT, util.SPEED_HIGH)
     assert device.serial_number == "EMULATED"
     (interface,) = device.get_active_configuration()
@@ -94,7 +86,7 @@ def test_the_device_is_found_with_its_descriptors(head: Faults, device: Any) -> 
     assert find_device(Faults(head.process, "127.0.0.1", 0)) is None or head.host == "127.0.0.1"
 
 
-def test_a_second_program_gets_a_busy_error(head: Faults, device: Any) -> None:
+def test_a_second_program_gets_a_busy_error(head, device):
     util.claim_interface(device, 0)
     other = find_device(head)
     with usb_error(errno.EBUSY):
@@ -104,7 +96,7 @@ def test_a_second_program_gets_a_busy_error(head: Faults, device: Any) -> None:
     util.dispose_resources(other)
 
 
-def test_a_paused_process_loses_no_frames(head: Faults, device: Any) -> None:
+def test_a_paused_process_loses_no_frames(head, device):
     """The process makes the frames of the pause afterwards; its queue has room for them."""
     before, decoder = head(do="counts"), Decoder(18, 3)
     start(device)
@@ -122,7 +114,7 @@ def test_a_paused_process_loses_no_frames(head: Faults, device: Any) -> None:
     assert after["lost"] == before["lost"]
 
 
-def test_a_read_times_out(head: Faults, device: Any) -> None:
+def test_a_read_times_out(head, device):
     device.ctrl_transfer(wire.REQUEST_OUT, Request.STOP, 0, 0, b"", 30_000)
     began = time.monotonic()
     with pytest.raises(core.USBTimeoutError) as caught:
@@ -131,20 +123,19 @@ def test_a_read_times_out(head: Faults, device: Any) -> None:
     assert time.monotonic() - began >= 0.15
 
 
-def test_a_stalled_endpoint_is_cleared_and_an_unknown_request_stalls(head: Faults, device: Any) -> None:
+def test_a_stalled_endpoint_is_cleared_and_an_unknown_request_stalls(head, device):
     start(device)
     head(do="stall")
-    with usb_error(errno.EPIPE):
-        device.read(ENDPOINT_IN, 4096, 30_000)
-    with usb_error(errno.EPIPE):
-        device.read(ENDPOINT_IN, 4096, 30_000)
+    for _ in range(2):
+        with usb_error(errno.EPIPE):
+            device.read(ENDPOINT_IN, 4096, 30_000)
     device.clear_halt(ENDPOINT_IN)
     assert len(device.read(ENDPOINT_IN, 4096, 30_000)) > 0
     with usb_error(errno.EPIPE):
         device.ctrl_transfer(wire.REQUEST_IN, 77, 0, 0, 8, 30_000)
 
 
-def test_unplugging_is_reported_and_the_old_handle_stays_invalid(head: Faults, device: Any) -> None:
+def test_unplugging_is_reported_and_the_old_handle_stays_invalid(head, device):
     start(device)
     device.read(ENDPOINT_IN, 4096, 30_000)
     head(do="unplug")
@@ -161,37 +152,25 @@ def test_unplugging_is_reported_and_the_old_handle_stays_invalid(head: Faults, d
     util.dispose_resources(again)
 
 
-def test_a_pending_read_ends_when_the_device_is_unplugged(head: Faults, device: Any) -> None:
-    caught: list[int | None] = []
-
-    def wait() -> None:
-        try:
-            device.read(ENDPOINT_IN, 4096, 60_000)
-        except core.USBError as error:
-            caught.append(error.errno)
-
+def test_a_pending_read_ends_when_the_device_is_unplugged(head, device):
     device.ctrl_transfer(wire.REQUEST_OUT, Request.STOP, 0, 0, b"", 30_000)
-    waiting = threading.Thread(target=wait)
-    waiting.start()
-    head(do="unplug")
-    waiting.join(60)
-    assert caught == [errno.ENODEV]
+    with ThreadPoolExecutor() as pool, usb_error(errno.ENODEV):
+        waiting = pool.submit(device.read, ENDPOINT_IN, 4096, 60_000)
+        head(do="unplug")
+        waiting.result(60)
 
 
-def test_an_invalid_configuration_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_configuration_is_refused(tmp_path, capsys):
     file = tmp_path / "head.json"
-    for content, named in (
-        (None, "head.json"),
-        ('{"hots": "127.0.0.1"}', "hots"),
-        ('{"maze": {"heights": [0.3]}}', "simulation.maze.heights"),
-    ):
+    wrong = {"": "head.json", '{"hots": ""}': "hots", '{"maze": {"heights": [0.3]}}': "maze.heights"}
+    for content, named in wrong.items():
         if content:
             file.write_text(content)
         assert main(["--config", str(file)]) == 2
         assert named in capsys.readouterr().err
 
 
-def test_a_dead_emulator_is_a_disconnected_device(tmp_path: Path, loopback: str) -> None:
+def test_a_dead_emulator_is_a_disconnected_device(tmp_path, loopback):
     host = f"127.0.1.{loopback.rsplit('.', 1)[1]}"
     with running(HeadEmulatorConfig(host=host, path={"explore": 5}), tmp_path) as head:
         device = find_device(head)
@@ -227,17 +206,18 @@ def test_damage_is_counted_exactly(reader, head):
     head(do="swap")
     swapped = reader.ring.newest[0]
     until(lambda: reader.ring.newest[0] > swapped + 100)
-    counts = reader.decoder.counts
-    assert counts.bad == 7
-    assert (counts.missing, counts.overruns, counts.duplicates, counts.restarts) == (37, 0, 0, 0)
-    first = reader.ring.newest[0] - counts.good - 37 + 1
-    number = reader.ring.between(first, 2**62).sequence
-    assert number[-1] - number[0] + 1 - len(number) == 37
+    assert reader.decoder.counts[1:] == (7, 37, 7 * 128 + 1000, 0, 0, 0)
 
 
-def test_unplugged_and_plugged_in_again(reader, head):
+def test_a_whisk_continues_after_a_stall_a_silence_and_unplugging(reader, head):
     driver = HeadDriver(reader, HEAD)
     driver.whisk(WhiskingConfig(mode="open", rate=5.0))
+    head(do="stall", seconds=0.3)
+    until(lambda: reader.stalls > 0)
+    until(lambda: reader.state == LinkState.STREAMING)
+    head(do="silence", seconds=2.0)
+    until(lambda: reader.state == LinkState.SILENT)
+    until(lambda: reader.state == LinkState.STREAMING)
     head(do="unplug")
     until(lambda: reader.state == LinkState.AWAY)
     head(do="plug")
@@ -247,25 +227,14 @@ def test_unplugged_and_plugged_in_again(reader, head):
     assert reader.fault is None
 
 
-def test_the_stream_continues_after_a_stall_and_a_silence(reader, head):
-    head(do="stall", seconds=0.3)
-    until(lambda: reader.stalls > 0)
-    until(lambda: reader.state == LinkState.STREAMING)
-    head(do="silence", seconds=2.0)
-    until(lambda: reader.state == LinkState.SILENT)
-    until(lambda: reader.state == LinkState.STREAMING)
-    assert reader.fault is None
-
-
-def whisk(host: str, mode: str, rcp: str) -> tuple[np.ndarray, np.ndarray, float]:
+def whisk(host, mode, rcp):
     """Largest angle and deflection [W] of a whisk, rad, and its share with feedback in the head."""
-    with HeadReader(
-        lambda: open_bridge(host), 18, HeadLinkConfig(rcp=rcp, silence=2.0, patience=60.0)
-    ) as reader:
+    config = HeadLinkConfig(rcp=rcp, silence=2.0, patience=60.0)
+    with HeadReader(lambda: open_bridge(host), 18, config) as reader:
         driver = HeadDriver(reader, HEAD)
         driver.whisk(WhiskingConfig(mode=mode, rate=4.0), np.full(18, 0.04), np.zeros(18))
 
-        def starts() -> np.ndarray:
+        def starts():
             frames = reader.ring.between(0, 2**62)
             return frames.sequence[(frames.flags & FrameFlag.CYCLE) > 0]
 
@@ -274,7 +243,7 @@ def whisk(host: str, mode: str, rcp: str) -> tuple[np.ndarray, np.ndarray, float
         frames = reader.ring.between(int(starts()[1]), int(starts()[2]) - 1)
         driver.rest()
 
-        def angles() -> np.ndarray:
+        def angles():
             newest = reader.ring.newest[0]
             return reader.ring.between(newest - 100, newest).values[..., 0] * ANGLE
 
@@ -284,11 +253,9 @@ def whisk(host: str, mode: str, rcp: str) -> tuple[np.ndarray, np.ndarray, float
     return size[:, 0], size[:, 2], float(np.mean((frames.flags & FrameFlag.RCP) > 0))
 
 
-@pytest.mark.parametrize(
-    "rcp",
-    ["head", pytest.param("host", marks=pytest.mark.soak)],  # on the host it fails if the host is late
-)
+@pytest.mark.parametrize("rcp", ["head", pytest.param("host", marks=pytest.mark.soak)])
 def test_feedback_reduces_amplitudes_on_contact(rcp, loopback, head):
+    """On the host it fails if the host is late."""
     angle, bent, fed = whisk(loopback, "open", "head")
     assert angle.max() == pytest.approx(np.radians(65), abs=0.02)
     touched = bent > 0.1

@@ -1,10 +1,6 @@
 """An emulated controller for each module, reset before each test, and an armed arm connected to it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,25 +8,25 @@ import pytest
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.dashboard import Dashboard
 from robot.drivers.ur10.driver_config import ArmConfig
-from tests.helpers.live import Faults, until, ur_emulator
+from tests.helpers.live import until, ur_emulator
 
 HOME = ArmConfig().placing.tcp_from_pose(np.array([0.63, 0.45, 0.0]))
 AWAY = ArmConfig().placing.tcp_from_pose(np.array([0.93, 0.45, 0.0]))  # 6 s away
 
 
-def settings(host: str, **others: Any) -> ArmConfig:
+def settings(host, **others):
     """Settings with long time-outs: emulator and tests share a busy machine."""
     patient = {"stale": 30.0, "heartbeat": 30.0, "watchdog_hz": 0.05, "connect": 60.0, "patience": 60.0}
     return ArmConfig(host=host, **{**patient, **others})
 
 
 @pytest.fixture(scope="module")
-def bench(loopback: str) -> Iterator[Callable[[], Faults]]:
+def bench(loopback):
     """Gives the running emulator, a new one where the last has ended."""
-    started: list[Faults] = []
+    started = []
     with ExitStack() as stack:
 
-        def running() -> Faults:
+        def running():
             if not started or started[-1].process.poll() is not None:
                 stack.close()
                 started.append(stack.enter_context(ur_emulator(loopback, HOME)))
@@ -40,7 +36,7 @@ def bench(loopback: str) -> Iterator[Callable[[], Faults]]:
 
 
 @pytest.fixture
-def controller(bench: Callable[[], Faults]) -> Faults:
+def controller(bench):
     """The emulated controller, without faults and with its tool at HOME."""
     faults = bench()
     faults(do="clear")
@@ -56,7 +52,7 @@ def controller(bench: Callable[[], Faults]) -> Faults:
 
 
 @pytest.fixture
-def arm(controller: Faults) -> Iterator[Arm]:
+def arm(controller):
     with Arm(settings(controller.host)) as arm:
         arm.start()
         yield arm

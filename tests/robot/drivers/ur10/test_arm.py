@@ -1,7 +1,4 @@
-"""The arm by the real library on an emulated controller: moves, an outcome for each fault, and sessions that
-are killed or hang during a motion: the arm stops, and no process or memory remains."""
-
-from __future__ import annotations
+"""The arm by the real library on an emulated controller: moves, faults, killed or hanging sessions."""
 
 import math
 import os
@@ -19,20 +16,20 @@ from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.dashboard import Dashboard
 from robot.drivers.ur10.driver_config import BoxConfig
 from robot.drivers.ur10.safety import SAFETY_STOPS, TargetRefused
-from tests.helpers.live import PATIENCE, ROOT, Faults, moves, until
+from tests.helpers.live import PATIENCE, ROOT, moves, until
 from tests.robot.drivers.ur10.conftest import AWAY, HOME, settings
 
 TARGET = HOME + [0.01, 0.02, 0.0, 0.0, 0.0, 0.0]
 
 
-def start_move(arm: Arm, controller: Faults) -> None:
+def start_move(arm, controller):
     """Starts a move and waits for full speed."""
     arm.move(AWAY)
     until(lambda: arm.fault or controller.state()["speed"][0] > 0.049, "the arm moves")
     assert arm.fault is None
 
 
-def check_stop(arm: Arm, controller: Faults, within: float = PATIENCE) -> SessionOutcome:
+def check_stop(arm, controller, within=PATIENCE):
     """Checks that a fault stops the arm before its target and that moves are refused; returns the outcome.
 
     Args:
@@ -50,7 +47,7 @@ def check_stop(arm: Arm, controller: Faults, within: float = PATIENCE) -> Sessio
     return fault.outcome
 
 
-def test_a_move_arrives(arm: Arm, controller: Faults) -> None:
+def test_a_move_arrives(arm, controller):
     """Also one to the present pose."""
     first = len(controller.state()["targets"])
     assert not arm.arrived()
@@ -69,7 +66,7 @@ def test_a_move_arrives(arm: Arm, controller: Faults) -> None:
     assert arm.fault is None
 
 
-def test_states_are_in_order(arm: Arm) -> None:
+def test_states_are_in_order(arm):
     until(lambda: len(arm.states()) > 100, "states")
     states = arm.states()
     assert (np.diff(states["counter"].astype(int)) == 1).all()
@@ -82,7 +79,7 @@ def test_states_are_in_order(arm: Arm) -> None:
     assert len(arm.states(after=int(states["counter"][-1]) - 3)) >= 3
 
 
-def test_moves_after_a_halt_and_instead_of_an_older_move(arm: Arm, controller: Faults) -> None:
+def test_moves_after_a_halt_and_instead_of_an_older_move(arm, controller):
     start_move(arm, controller)
     arm.halt()
     until(lambda: not controller.state()["moving"], "a standstill")
@@ -98,24 +95,19 @@ def test_moves_after_a_halt_and_instead_of_an_older_move(arm: Arm, controller: F
 
 STALE, MALFORMED, GONE = SessionOutcome.ARM_STALE, SessionOutcome.ARM_MALFORMED, SessionOutcome.ARM_GONE
 FAULTS = {
-    "protective": SessionOutcome.PROTECTIVE_STOP,
-    "safeguard": SessionOutcome.SAFEGUARD_STOP,
-    "stall": STALE,
-    "malformed": MALFORMED,
-    "truncated": MALFORMED,
-    "huge": STALE,
-    "nan": MALFORMED,
-    "freeze": STALE,
-    "the program is ended": GONE,
-    "the process crashes": GONE,
-    "the process hangs": STALE,
-}
+    "protective": SessionOutcome.PROTECTIVE_STOP, "safeguard": SessionOutcome.SAFEGUARD_STOP,
+    "place": SessionOutcome.OUT_OF_BOX, "stall": STALE, "malformed": MALFORMED, "truncated": MALFORMED,
+    "huge": STALE, "nan": MALFORMED, "freeze": STALE, "the program is ended": GONE,
+    "the process crashes": GONE, "the process hangs": STALE,
+}  # fmt: skip
+MORE = {"stall": {"seconds": PATIENCE}, "place": {"tcp": (HOME + [0, 0.21, 0, 0, 0, 0]).tolist()}}
+BOX = BoxConfig(low=tuple(HOME[:3] - 0.2), high=tuple(HOME[:3] + [0.5, 0.2, 0.2]))
 
 
 @pytest.mark.parametrize("fault", [*FAULTS, pytest.param("emergency", marks=pytest.mark.soak)])
-def test_a_fault_stops_the_arm(controller: Faults, fault: str) -> None:
+def test_a_fault_stops_the_arm(controller, fault):
     outcome = FAULTS.get(fault, SessionOutcome.EMERGENCY_STOP)
-    with Arm(settings(controller.host, stale=1.0 if outcome is STALE else 30.0)) as arm:
+    with Arm(settings(controller.host, stale=1.0 if outcome is STALE else 30.0, box=BOX)) as arm:
         arm.start()
         start_move(arm, controller)
         if fault == "the program is ended":
@@ -124,7 +116,7 @@ def test_a_fault_stops_the_arm(controller: Faults, fault: str) -> None:
         elif fault.startswith("the process"):
             os.kill(arm.process.pid, signal.SIGSTOP if "hangs" in fault else signal.SIGSEGV)
         else:
-            controller(do=fault, **({"seconds": PATIENCE} if fault == "stall" else {}))
+            controller(do=fault, **MORE.get(fault, {}))
         assert check_stop(arm, controller) is outcome
         assert len(arm.history) > 10
         assert fault == "nan" or np.isfinite(arm.history["tcp"]).all()
@@ -140,7 +132,7 @@ def test_a_fault_stops_the_arm(controller: Faults, fault: str) -> None:
 
 
 @pytest.mark.soak
-def test_a_stall_is_detected_in_time(controller: Faults) -> None:
+def test_a_stall_is_detected_in_time(controller):
     with Arm(settings(controller.host, stale=0.5)) as arm:
         arm.start()
         start_move(arm, controller)
@@ -150,13 +142,13 @@ def test_a_stall_is_detected_in_time(controller: Faults) -> None:
         assert arm.fault.time - began < arm.config.stale + 0.3
 
 
-def test_the_controller_dies(arm: Arm, controller: Faults) -> None:
+def test_the_controller_dies(arm, controller):
     start_move(arm, controller)
     controller.die()
     assert until(lambda: arm.fault, "a fault").outcome is GONE
 
 
-def test_a_stop_without_effect_is_repeated_by_the_dashboard(arm: Arm, controller: Faults) -> None:
+def test_a_stop_without_effect_is_repeated_by_the_dashboard(arm, controller):
     start_move(arm, controller)
     ends = controller.state()["program_stops"]
     os.kill(arm.process.pid, signal.SIGSTOP)
@@ -167,7 +159,7 @@ def test_a_stop_without_effect_is_repeated_by_the_dashboard(arm: Arm, controller
     os.kill(arm.process.pid, signal.SIGKILL)
 
 
-def test_a_target_without_joint_solution(arm: Arm, controller: Faults) -> None:
+def test_a_target_without_joint_solution(arm, controller):
     first = len(controller.state()["targets"])
     controller(do="ik_fails")
     arm.move(AWAY)
@@ -175,7 +167,7 @@ def test_a_target_without_joint_solution(arm: Arm, controller: Faults) -> None:
     assert moves(controller, first) == []
 
 
-def test_a_move_that_does_not_arrive(controller: Faults) -> None:
+def test_a_move_that_does_not_arrive(controller):
     with Arm(settings(controller.host, patience=0.3)) as arm:
         arm.start()
         arm.move(HOME + [0.01, 0, 0, 0, 0, 0])
@@ -183,16 +175,7 @@ def test_a_move_that_does_not_arrive(controller: Faults) -> None:
         assert check_stop(arm, controller) is SessionOutcome.NOT_ARRIVED
 
 
-def test_a_state_out_of_the_box(controller: Faults) -> None:
-    box = BoxConfig(low=tuple(HOME[:3] - 0.2), high=tuple(HOME[:3] + [0.5, 0.2, 0.2]))
-    with Arm(settings(controller.host, box=box)) as arm:
-        arm.start()
-        start_move(arm, controller)
-        controller(do="place", tcp=(HOME + [0, 0.21, 0, 0, 0, 0]).tolist())
-        assert check_stop(arm, controller) is SessionOutcome.OUT_OF_BOX
-
-
-def test_a_collision_with_a_wall(controller: Faults) -> None:
+def test_a_collision_with_a_wall(controller):
     at = HOME[0] + 0.02
     with Arm(settings(controller.host, force_limit=20.0)) as arm:
         arm.start()
@@ -205,10 +188,9 @@ def test_a_collision_with_a_wall(controller: Faults) -> None:
         until(lambda: controller.state()["tcp"][0] < at - 0.006, "the tool backs off")
         until(arm.still)
         assert at - 0.0105 < controller.state()["tcp"][0]
-        assert arm.fault.outcome is SessionOutcome.CONTACT
 
 
-def test_a_contact_reported_by_the_session(arm: Arm, controller: Faults) -> None:
+def test_a_contact_reported_by_the_session(arm, controller):
     start_move(arm, controller)
     until(lambda: controller.state()["tcp"][0] > HOME[0] + 0.012, "room for the retreat")
     arm.fail(SessionOutcome.CONTACT, "a whisker is bent too far")
@@ -217,7 +199,7 @@ def test_a_contact_reported_by_the_session(arm: Arm, controller: Faults) -> None
     assert arm.fault.outcome is SessionOutcome.CONTACT
 
 
-def test_the_rtde_process_checks_every_command(arm: Arm, controller: Faults) -> None:
+def test_the_rtde_process_checks_every_command(arm, controller):
     first = len(controller.state()["targets"])
     here, stops = controller.state()["tcp"], int(arm.shared.control["stops"])
     for number, target in enumerate(([math.nan] * 6, [9.0, *here[1:]], here[:5], [*here[:3], 0.0, 0.0, 0.0])):
@@ -241,7 +223,7 @@ time.sleep(600)
 """
 
 
-def runs(pid: int) -> bool:
+def runs(pid):
     """Whether a process runs; a zombie does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
@@ -250,7 +232,7 @@ def runs(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("what", ["killed", "hangs", "killed with the arm's process"])
-def test_the_arm_stops_when_the_session_ends_or_hangs(controller: Faults, what: str) -> None:
+def test_the_arm_stops_when_the_session_ends_or_hangs(controller, what):
     words = [sys.executable, "-c", SESSION, controller.host, *map(repr, AWAY.tolist())]
     session = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     try:
@@ -259,10 +241,11 @@ def test_the_arm_stops_when_the_session_ends_or_hangs(controller: Faults, what: 
         shared = [line.split(maxsplit=5)[5] for line in maps if "/dev/shm/" in line]
         until(lambda: controller.state()["speed"][0] > 0.049, "the arm moves")
         bites = controller.state()["watchdog_stops"]
-        if what == "killed with the arm's process":
+        both = what == "killed with the arm's process"
+        if both:
             os.kill(pid, signal.SIGSTOP)  # so that it does not detect the end first
         session.send_signal(signal.SIGSTOP if what == "hangs" else signal.SIGKILL)
-        if what == "killed with the arm's process":
+        if both:
             os.kill(pid, signal.SIGKILL)
         until(lambda: not controller.state()["moving"], "a standstill")
         place = controller.state()["tcp"]
@@ -270,8 +253,7 @@ def test_the_arm_stops_when_the_session_ends_or_hangs(controller: Faults, what: 
         until(lambda: not runs(pid), "the arm's process ends")
         until(lambda: controller.state()["runtime"] == "STOPPED", "the controller's program ends")
         assert controller.state()["tcp"] == place
-        if what == "killed with the arm's process":
-            assert controller.state()["watchdog_stops"] == bites + 1
+        assert not both or controller.state()["watchdog_stops"] == bites + 1
         if what != "hangs":
             session.wait(30)
             assert not [name for name in shared if Path(name).exists()], "shared memory remains"

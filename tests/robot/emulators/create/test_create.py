@@ -1,9 +1,5 @@
 """An emulated Create among walls: contact, odometry, strain of its whiskers."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,13 +10,7 @@ from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
 from robot.emulators.create.emulator_config import CreateWorldConfig
 from robot.emulators.create.server import CreateWhiskers, Terminal
 from robot.emulators.head.emulated_device import EmulatedHead
-from robot.simulation.create.strain_sensors import (
-    ShakeConfig,
-    WhiskersConfig,
-    base_strains,
-    bend_whiskers,
-    fixed_whiskers,
-)
+from robot.simulation.create.strain_sensors import WhiskersConfig, base_strains, bend_whiskers, fixed_whiskers
 from robot.simulation.create.wheel_odometry import WheelsConfig
 from robot.world.arena import Arena
 from tactile.base.errors import InputError
@@ -29,24 +19,22 @@ from tactile.base.random_streams import stream
 CORNERS = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
 ROOM = Arena("room", CORNERS, (), np.array([1.0, 1.0, 0.0]))
 BODY = 0.17
-
-
 EXACT = CreateWorldConfig(wheels=WheelsConfig(noise="none"))
 
 
-def robot_in(world: CreateWorldConfig, arena: Arena = ROOM, seed: int = 0) -> EmulatedCreate:
+def robot_in(world, arena=ROOM, seed=0):
     robot = EmulatedCreate(CreateEmulatorConfig(world=world, seed=seed), arena)
     robot.receive(START + SAFE)
     return robot
 
 
-def move(robot: EmulatedCreate, right: int, left: int, seconds: float) -> None:
+def move(robot, right, left, seconds):
     """Turns the wheels for some seconds, mm/s."""
     robot.receive(drive(right, left))
     robot.advance(seconds)
 
 
-def test_a_wall_stops_the_body_and_presses_the_bumper_while_the_wheels_slip() -> None:
+def test_a_wall_stops_the_body_and_presses_the_bumper_while_the_wheels_slip():
     robot = robot_in(EXACT)
     move(robot, 200, 200, 10.0)
     assert robot.base.x == pytest.approx(2.0 - BODY, abs=0.003)
@@ -64,7 +52,7 @@ def test_a_wall_stops_the_body_and_presses_the_bumper_while_the_wheels_slip() ->
     assert robot.base.x == pytest.approx(2.0 - BODY - 0.1, abs=0.005)
 
 
-def test_odometry_has_one_error_for_the_whole_session() -> None:
+def test_odometry_has_one_error_for_the_whole_session():
     wide = ROOM._replace(outer=100 * ROOM.outer, start=np.array([50.0, 50.0, 0.0]))
     shares = []
     for seed in range(12):
@@ -78,19 +66,16 @@ def test_odometry_has_one_error_for_the_whole_session() -> None:
     assert abs(np.mean(shares) - 1) < 0.05
 
 
-def test_the_strain_is_that_of_the_simulator() -> None:
+def test_the_strain_is_that_of_the_simulator():
     """Within the resolution of the samples."""
-    still = ShakeConfig(start=0.0, rumble=0.0)
-    config = WhiskersConfig(noise=0.0, shake=still)
-    near = ROOM._replace(start=np.array([1.75, 1.0, 0.3]))
+    config = WhiskersConfig(noise=0.0, shake={"start": 0.0, "rumble": 0.0})
     world = CreateWorldConfig(whiskers=config)
-    robot = robot_in(world, near)
+    robot = robot_in(world, ROOM._replace(start=np.array([1.75, 1.0, 0.3])))
     whiskers = CreateWhiskers(world, robot, robot.advance_to, stream(0, "strain"))
     bridge = EmulatedHead(world.bridge, whiskers, now=0.0)
     bridge.control(REQUEST_OUT, Request.START, 0, 0, 0.0)
     robot.receive(drive(50, 50))
-    got, poses = [], []
-    decoder = Decoder(whiskers.count)
+    got, poses, decoder = [], [], Decoder(whiskers.count)
     for block in range(20):
         before = robot.pose
         assert bridge.advance((block + 1) * 0.01 + 1e-9)
@@ -105,7 +90,7 @@ def test_the_strain_is_that_of_the_simulator() -> None:
     assert np.abs(strain - expected).max() <= 0.51 * ANGLE * world.strain_per_radian
 
 
-def test_rolling_shakes_the_whiskers_and_standing_does_not() -> None:
+def test_rolling_shakes_the_whiskers_and_standing_does_not():
     world = CreateWorldConfig()
     robot = robot_in(world)
     whiskers = CreateWhiskers(world, robot, robot.advance_to, stream(0, "strain"))
@@ -117,7 +102,7 @@ def test_rolling_shakes_the_whiskers_and_standing_does_not() -> None:
     assert loud > 2 * quiet
 
 
-def test_a_file_is_not_replaced_by_the_link_of_the_port(tmp_path: Path) -> None:
+def test_a_file_is_not_replaced_by_the_link_of_the_port(tmp_path):
     pytest.importorskip("termios", reason="needs pseudo-terminals")
     name = tmp_path / "create.tty"
     for make in (lambda: name.write_text("mine"), lambda: name.symlink_to("/etc/hostname")):

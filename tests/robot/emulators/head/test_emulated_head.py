@@ -1,10 +1,6 @@
 """Emulated heads: all frames are counted, faults have their effect, whiskers agree with the simulator."""
 
-from __future__ import annotations
-
-import errno
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,14 +25,11 @@ from tactile.whisking import WhiskingConfig
 from tests.helpers.live import until, ur_emulator
 from tests.robot.emulators.head.heads import TABLE, HostedHead, drive, open_drive, running, started, world
 
+STEP = st.tuples(st.just("push"), st.integers(1, 20)) | st.tuples(st.just("take"), st.integers(1, 900))
 
-@given(
-    st.integers(1, 30),
-    st.lists(
-        st.tuples(st.just("push"), st.integers(1, 20)) | st.tuples(st.just("take"), st.integers(1, 900))
-    ),
-)
-def test_frames_are_sent_lost_or_waiting(capacity: int, steps: list[tuple[str, int]]) -> None:
+
+@given(st.integers(1, 30), st.lists(STEP))
+def test_frames_are_sent_lost_or_waiting(capacity, steps):
     fifo, made, held, read = Fifo(capacity), 0, b"", b""
     for step, count in steps:
         if step == "push":
@@ -55,11 +48,10 @@ def test_frames_are_sent_lost_or_waiting(capacity: int, steps: list[tuple[str, i
         assert fifo.sent == len(read) // 32
     assert held.startswith(read)
     fifo.clear()
-    assert len(fifo) == 0
-    assert fifo.made == fifo.sent + fifo.lost + fifo.dropped
+    assert (len(fifo), fifo.made) == (0, fifo.sent + fifo.lost + fifo.dropped)
 
 
-def test_unread_frames_beyond_the_capacity_are_lost() -> None:
+def test_unread_frames_beyond_the_capacity_are_lost():
     head = started(fifo=100)
     assert len(head.pass_by(0.1).values) == 200
     assert len(head.pass_by(0.5, read=False).values) == 0
@@ -72,18 +64,21 @@ def test_unread_frames_beyond_the_capacity_are_lost() -> None:
     assert (head.decoder.counts.missing, head.decoder.counts.bad) == (920, 0)
 
 
-def test_times_follow_from_the_numbers() -> None:
+def test_times_follow_from_the_numbers_until_the_clock_jumps():
     head = started()
     head.pass_by(0.2)
     head.stop()
     assert len(head.pass_by(0.3).values) == 0
     head.start()
     frames = head.pass_by(0.1)
-    assert frames.sequence[0] == 1000  # numbers advance while stopped
+    assert frames.sequence.tolist() == list(range(1000, 1200))  # numbers advance while stopped
     assert (frames.time == 500 * frames.sequence).all()
+    head.do("clock", jump_us=123_456)
+    after = head.pass_by(0.1)
+    assert (after.sequence[0], after.time[0]) == (1200, 500 * 1200 + 123_456)
 
 
-def test_a_stop_drops_queued_frames_and_retracts() -> None:
+def test_a_stop_drops_queued_frames_and_retracts():
     head = started(drive(), mechanics={"noise": 0.0})
     head.pass_by(0.4)
     head.pass_by(0.1, read=False)
@@ -96,7 +91,7 @@ def test_a_stop_drops_queued_frames_and_retracts() -> None:
     assert (state["resting"], state["angle"]) == (True, [0.0] * 18)
 
 
-def test_numbers_and_times_wrap() -> None:
+def test_numbers_and_times_wrap():
     for age, name in ((wire.WRAP / 1e6 - 0.05, "time"), (wire.WRAP / 2000 - 0.05, "sequence")):
         head = started(age=age)
         frames = head.pass_by(0.2)
@@ -105,7 +100,7 @@ def test_numbers_and_times_wrap() -> None:
         assert (np.diff(raw) < 0).sum() == 1
 
 
-def test_clock_drift() -> None:
+def test_clock_drift():
     head = started(drift_ppm=500.0)
     times, frames = [], 0
     for _ in range(2):
@@ -117,16 +112,7 @@ def test_clock_drift() -> None:
     assert 4_002 - head.bridge.samples <= frames <= 4_002
 
 
-def test_clock_jump() -> None:
-    head = started()
-    before = head.pass_by(0.1)
-    head.do("clock", jump_us=123_456)
-    after = head.pass_by(0.1)
-    assert after.time[0] - before.time[-1] == 500 + 123_456
-    assert after.sequence[0] == before.sequence[-1] + 1
-
-
-def test_counts_of_damaged_skipped_and_garbage_data() -> None:
+def test_counts_of_damaged_skipped_swapped_and_garbage_data():
     head = started()
     head.pass_by(0.1)
     head.do("corrupt", frames=33)
@@ -142,18 +128,14 @@ def test_counts_of_damaged_skipped_and_garbage_data() -> None:
     assert head.decoder.counts.missing == 90
     counted = head.do("counts")
     assert counted["made"] == counted["sent"] + counted["skipped"] == 800
-
-
-def test_frames_may_come_out_of_order() -> None:
-    head = started()
     head.do("swap", frames=2)
-    order = head.pass_by(0.1).sequence
+    order = head.pass_by(0.1).sequence - 800
     assert sorted(order.tolist()) == list(range(200))
     assert order[[18, 19, 38, 39]].tolist() == [19, 18, 39, 38]
-    assert head.decoder.counts.missing == 0
+    assert head.decoder.counts.missing == 90
 
 
-def test_a_saturated_whisker() -> None:
+def test_a_saturated_whisker():
     head = started()
     head.do("saturate", whisker=5, seconds=0.2)
     y = head.pass_by(0.5).values[:, :, 2] * wire.ANGLE
@@ -163,14 +145,17 @@ def test_a_saturated_whisker() -> None:
     assert np.abs(np.delete(y, 5, axis=1)).max() < 0.1
 
 
-def test_a_stall_ends_when_cleared_after_its_duration() -> None:
+def test_a_silence_delays_frames_and_a_stall_ends_when_cleared_after_its_duration():
     head = started()
+    head.do("silence", seconds=1.0)
+    assert len(head.pass_by(1.0 - BLOCK).values) == 0
+    assert len(head.pass_by(0.1).values) == 2180
+    assert head.do("counts")["lost"] == 0
     head.pass_by(0.1, read=False)
     head.do("stall", seconds=0.2)
     for _ in range(2):
-        with pytest.raises(OSError, match="pipe") as caught:
+        with pytest.raises(BrokenPipeError):
             head.read()
-        assert caught.value.errno == errno.EPIPE
         head.bridge.faults.clear_halt()
     head.pass_by(0.3, read=False)
     assert len(head.read()) == 128 * 800
@@ -179,15 +164,7 @@ def test_a_stall_ends_when_cleared_after_its_duration() -> None:
         head.read(later=60)
 
 
-def test_frames_are_delayed_by_a_silence() -> None:
-    head = started()
-    head.do("silence", seconds=1.0)
-    assert len(head.pass_by(1.0 - BLOCK).values) == 0
-    assert len(head.pass_by(0.1).values) == 2180
-    assert head.do("counts")["lost"] == 0
-
-
-def test_unplugging_ends_the_stream() -> None:
+def test_unplugging_ends_the_stream():
     head = started(drive())
     head.pass_by(0.2)
     head.do("unplug")
@@ -199,7 +176,7 @@ def test_unplugging_ends_the_stream() -> None:
     assert len(head.pass_by(0.1).values) == 200
 
 
-def test_identity_and_unknown_requests() -> None:
+def test_identity_and_unknown_requests():
     head = HostedHead(HeadEmulatorConfig(head={"whiskers": 4}))
     identity = json.loads(head.bridge.control(wire.REQUEST_IN, wire.Request.IDENTITY, 0, 1024, 0.0))
     assert (identity["whiskers"], identity["channels"], identity["rate"]) == (12, 3, 2000.0)
@@ -210,21 +187,16 @@ def test_identity_and_unknown_requests() -> None:
             head.bridge.control(kind, request, value, 64, 0.0)
 
 
-def test_invalid_commands_are_ignored() -> None:
+def test_invalid_commands_are_ignored_and_fault_requests_refused():
     head = started(drive())
     for packet in (b"", b"WHKC" + bytes(60), bytes(32)):
         head.bridge.bulk_out(packet, head.now)
     head.pass_by(0.1, awake=False)
     assert head.do("state")["commands"] == {"DRIVE": 1, "": 3}
-
-
-@pytest.mark.parametrize(
-    "fault",
-    [{}, {"do": "explode"}, {"do": "saturate", "whisker": 18}, {"do": "clock"}, {"do": "stall", "for": 3}],
-)
-def test_invalid_fault_requests_are_refused(fault: dict[str, object]) -> None:
-    with pytest.raises((TypeError, ValueError)):
-        started().bridge.do(fault, 0.0)
+    for fault in ({}, {"do": "explode"}, {"do": "saturate", "whisker": 18}, {"do": "clock"},
+                  {"do": "stall", "for": 3}):  # fmt: skip
+        with pytest.raises((TypeError, ValueError)):
+            head.bridge.do(fault, 0.0)
 
 
 PLACING = BaseTransformConfig(x=-0.4, y=0.3, z=0.12, yaw_deg=30.0)
@@ -238,27 +210,21 @@ last bit of the time."""
 class Arm:
     """An arm with the state that the test sets."""
 
-    def __init__(self) -> None:
-        self.state: ToolPose | None = None
+    state = None
 
-    def latest(self) -> ToolPose | None:
+    def latest(self):
         return self.state
 
-    def put(self, time: float, pose: list[float], lift: float = 0.0) -> None:
-        self.state = ToolPose(time, PLACING.tcp_from_pose(np.array(pose), lift), np.zeros(6), time)
+    def put(self, time, pose, lift=0.0, speed=(0.0,) * 6):
+        self.state = ToolPose(time, PLACING.tcp_from_pose(np.array(pose), lift), np.array(speed), time)
 
 
-@pytest.mark.parametrize(
-    ("mode", "frequency", "baseline"),
-    [
-        (FeedbackMode.OPEN, 1.0, HALL_BASELINE),
-        (FeedbackMode.RCP, 1.0, HALL_BASELINE),
-        (FeedbackMode.RCP, 2.0, BaselineConfig()),
-    ],
-)
-def test_samples_along_a_path_agree_with_the_simulator(
-    mode: FeedbackMode, frequency: float, baseline: BaselineConfig
-) -> None:
+WHISKS = [(FeedbackMode.OPEN, 1.0, HALL_BASELINE), (FeedbackMode.RCP, 1.0, HALL_BASELINE),
+          (FeedbackMode.RCP, 2.0, BaselineConfig())]  # fmt: skip
+
+
+@pytest.mark.parametrize(("mode", "frequency", "baseline"), WHISKS)
+def test_samples_along_a_path_agree_with_the_simulator(mode, frequency, baseline):
     more = {"stream": {"rate": ODD}, "head": {"dead": (4,)}, "mechanics": {"baseline": baseline}}
     config = HeadEmulatorConfig(follow=True, path={"explore": 9}, seed=3, **more)
     scene = world(config)
@@ -275,9 +241,8 @@ def test_samples_along_a_path_agree_with_the_simulator(
     start, random = np.arange(3 * frequency) / frequency, stream(config.seed, "sensor")
     rest = make_baseline(baseline, config.mechanics.noise, ODD, 18, config.seed)
     threshold = command.numbers * wire.ANGLE
-    raw = simulate_cycles(
-        simulate_quasistatic, setup, scene.surroundings, scene.path, start, random, threshold, rest
-    )
+    walls, path = scene.surroundings, scene.path
+    raw = simulate_cycles(simulate_quasistatic, setup, walls, path, start, random, threshold, rest)
     expected = np.concatenate([wire.frame_values(cycle.angle, cycle.deflection) for cycle in raw])
     off = np.abs(expected.astype(int) - frames.values)
     assert np.abs(expected[..., 2] * wire.ANGLE).max() > 0.05
@@ -286,7 +251,7 @@ def test_samples_along_a_path_agree_with_the_simulator(
     assert (frames.flags & FrameFlag.RCP).any() == (mode == FeedbackMode.RCP)
 
 
-def test_a_whisk_may_end_within_a_block() -> None:
+def test_a_whisk_may_end_within_a_block():
     head = started(open_drive(frequency=1.3))
     frames = head.pass_by(3.0)
     samples = round(2000 / 1.3)
@@ -297,7 +262,7 @@ def test_a_whisk_may_end_within_a_block() -> None:
 
 
 @pytest.mark.parametrize("lift", [0.0, 0.02, -0.004])
-def test_samples_of_a_carried_head_agree_with_a_fixed_one(lift: float) -> None:
+def test_samples_of_a_carried_head_agree_with_a_fixed_one(lift):
     """A lift has the effect of walls lower by that lift."""
     config = HeadEmulatorConfig(path={"explore": 9}, mechanics=NOISELESS)
     walls = world(config).surroundings.walls
@@ -314,7 +279,7 @@ def test_samples_of_a_carried_head_agree_with_a_fixed_one(lift: float) -> None:
     assert expected.any() == ((found[0][..., 2] * wire.ANGLE).max() > 0.05)
 
 
-def test_no_contact_when_lifted_or_before_the_first_arm_state() -> None:
+def test_no_contact_when_lifted_or_before_the_first_arm_state():
     arm = Arm()
     head = HostedHead(QUIET, TABLE, CarriedByArm(arm, PLACING)).start(drive())
     assert not head.deflections(1.0).any()
@@ -325,13 +290,11 @@ def test_no_contact_when_lifted_or_before_the_first_arm_state() -> None:
     assert head.do("state")["lift"] == pytest.approx(0.2)
 
 
-def test_poses_between_arm_states_are_extrapolated() -> None:
+def test_poses_between_arm_states_are_extrapolated():
     arm, home = Arm(), np.array([0.5, 0.4, 3.1])
-    place = CarriedByArm(arm, PLACING)
-    tcp = PLACING.tcp_from_pose(home)
-    arm.state = ToolPose(10.0, tcp, np.array([0.03, -0.01, 0.02, 0.0, 0.0, 0.4]), 10.0)
-    rows = [place.at(10.0 + ahead) for ahead in (0.0, 0.02, 0.05, AHEAD, 5.0)]
-    poses, lifts = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    arm.put(10.0, home, speed=(0.03, -0.01, 0.02, 0.0, 0.0, 0.4))
+    rows = [CarriedByArm(arm, PLACING).at(10.0 + ahead) for ahead in (0.0, 0.02, 0.05, AHEAD, 5.0)]
+    poses, lifts = map(np.array, zip(*(row[:2] for row in rows), strict=True))
     np.testing.assert_allclose(poses[0], home, atol=1e-9)
     times = np.array([0.0, 0.02, 0.05, AHEAD, AHEAD])
     np.testing.assert_allclose(np.hypot(*(poses - home)[:, :2].T), np.hypot(0.03, 0.01) * times, atol=1e-9)
@@ -339,7 +302,7 @@ def test_poses_between_arm_states_are_extrapolated() -> None:
     np.testing.assert_allclose(lifts, 0.02 * times, atol=1e-9)
 
 
-def test_whiskers_retract_without_commands() -> None:
+def test_whiskers_retract_without_commands():
     head = started(open_drive(), mechanics=NOISELESS)
     assert head.angles(0.4).max() > 0.5
     frames = head.pass_by(2.0, awake=False)
@@ -355,7 +318,7 @@ def test_whiskers_retract_without_commands() -> None:
     assert head.angles(1.0).max() > 0.5
 
 
-def test_a_new_drive_command_starts_with_the_next_cycle() -> None:
+def test_a_new_drive_command_starts_with_the_next_cycle():
     head = started(open_drive(), mechanics=NOISELESS)
     head.pass_by(0.3)
     head.send(open_drive(frequency=2.0, amplitude=0.3, offset=0.2))
@@ -368,7 +331,7 @@ def test_a_new_drive_command_starts_with_the_next_cycle() -> None:
     assert angle[1400:].min() == pytest.approx(0.2, abs=1e-3)
 
 
-def test_amplitudes_from_the_host_last_one_cycle() -> None:
+def test_amplitudes_from_the_host_last_one_cycle():
     head = HostedHead(QUIET, TABLE._replace(height=np.array([0.0]))).start(open_drive())
     head.pass_by(0.1)
     lower = np.linspace(0.1, 0.9, 18)
@@ -378,7 +341,7 @@ def test_amplitudes_from_the_host_last_one_cycle() -> None:
     np.testing.assert_allclose(angle[1800:].max(axis=0), np.radians(65), atol=1e-3)
 
 
-def test_feedback_is_relative_to_the_centre() -> None:
+def test_feedback_is_relative_to_the_centre():
     most = []
     for centre in (0.0, 0.3):
         offset = Command(CommandKind.CENTRE, numbers=wire.to_counts(np.full(18, centre)))
@@ -387,34 +350,30 @@ def test_feedback_is_relative_to_the_centre() -> None:
     assert most[1] < 0.7 * most[0]  # counts as contact from the start
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [{"frequency": 0.0}, {"frequency": 1e6}, {"amplitude": -0.1}, {"gain": -1.0}, {"window": 0.0}],
-    ids=str,
-)
-def test_invalid_drive_commands_are_ignored(bad: dict[str, float]) -> None:
-    assert np.abs(started(drive(**bad)).angles(0.5)).max() < 0.02
+def test_invalid_drive_commands_are_ignored():
+    for bad in ({"frequency": 0.0}, {"frequency": 1e6}, {"amplitude": -0.1}, {"gain": -1.0}, {"window": 0.0}):
+        assert np.abs(started(drive(**bad)).angles(0.5)).max() < 0.02, bad
 
 
-def test_drives_stop_at_their_limit() -> None:
+def test_drives_stop_at_their_limit():
     head = started(open_drive(offset=0.3), head=HeadConfig(limit_deg=50.0), mechanics=NOISELESS)
     assert head.angles(1.0).max() <= np.radians(50) + wire.ANGLE
 
 
-def test_no_samples_are_computed_without_a_stream() -> None:
+def test_no_samples_are_computed_without_a_stream():
     """A head at rest computes nothing, and its noise starts with the first frame."""
     quick, late = HostedHead(), HostedHead()
     late.pass_by(3 * BLOCK)
     assert np.array_equal(quick.start().pass_by(0.1).values, late.start().pass_by(0.1).values)
 
 
-def test_a_head_in_a_process_follows_the_tool_of_a_controller(tmp_path: Path, loopback: str) -> None:
+def test_a_head_in_a_process_follows_the_tool_of_a_controller(tmp_path, loopback):
     placing = BaseTransformConfig()
     here, there = np.array([0.27, 0.27, 0.5]), np.array([0.63, 0.45, -2.0])
     config = HeadEmulatorConfig(host=loopback, path={"explore": 5}, arm=loopback, placing=placing)
     with ur_emulator(loopback, placing.tcp_from_pose(here, 0.1)) as arm, running(config, tmp_path) as head:
 
-        def is_at(pose: np.ndarray, lift: float) -> bool:
+        def is_at(pose, lift):
             state = head(do="state")
             level = state["lift"] is not None and abs(state["lift"] - lift) < 1e-6
             return level and bool(np.allclose(state["pose"], pose, atol=1e-6))

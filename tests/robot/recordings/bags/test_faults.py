@@ -1,12 +1,8 @@
 """Bags that cannot be read, and settings that do not fit: one clear error each, or a warning."""
 
-from __future__ import annotations
-
+import re
 import shutil
 import sqlite3
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,33 +14,18 @@ from robot.recordings.formats import open_recording
 from robot.recordings.mcap_writer import recover
 from robot.recordings.recording_config import RecordingConfig
 from tactile.base import bounded
-from tactile.base.errors import InputError
 from tests.helpers.ros_bags import Entry, header, odometry, pose, scan
-from tests.robot.recordings.bags.conftest import (
-    SCANS,
-    START,
-    STEP,
-    TIMES,
-    WHEELS,
-    framed,
-    link,
-    opened,
-)  # fmt: skip
+from tests.robot.recordings.bags.conftest import SCANS, START, STEP, TIMES, WHEELS, framed, link, opened
 
 RING = [scan(time, np.linspace(1 + 0.1 * row, 4, 36), -np.pi, np.pi / 18) for row, time in enumerate(TIMES)]
 MOUNT = [link("base_link", "laser", np.pi / 2)]
-Refused = Callable[..., InputError]
-Write = Callable[..., Path]
 
 
-def with_stamps(stamps: Sequence[int]) -> list[Entry]:
-    return [
-        odometry(stamp, 0.1 * row, 0.0, 0.0)._replace(time=time)
-        for row, (stamp, time) in enumerate(zip(stamps, TIMES, strict=False))
-    ]
+def with_stamps(stamps):
+    return [odometry(stamps[row], 0.1 * row, 0, 0)._replace(time=TIMES[row]) for row in range(12)]
 
 
-def renamed(entries: list[Entry], frame: str, child: str) -> list[Entry]:
+def renamed(entries, frame, child):
     for entry in entries:
         entry.fields["header"]["frame_id"], entry.fields["child_frame_id"] = frame, child
     return entries
@@ -58,7 +39,7 @@ def test_what_expands_to_too_much_is_refused(kind, write, refused, monkeypatch):
     refused(lambda: opened(path, views="/scan"), "expands to", "at most 1 MiB: 1 MiB, or 32 times")
 
 
-MISSING: dict[str, tuple[dict[str, Any], list[str]]] = {
+MISSING = {
     "topic": ({"views": "/scna"}, ["no topic '/scna'", "'/lab', '/odom', '/scan'", "did you mean '/scan'?"]),
     "views of another type": ({"views": "/lab"}, ["/lab: messages of type lab_msgs/msg/Custom", "LaserScan"]),
     "odometry of another type": ({"odometry": "/scan"}, ["/scan: messages of type", "nav_msgs/msg/Odometry"]),
@@ -71,14 +52,14 @@ MISSING: dict[str, tuple[dict[str, Any], list[str]]] = {
 
 
 @pytest.mark.parametrize("case", MISSING)
-def test_missing_topics_are_named_with_those_that_exist(case: str, write: Write, refused: Refused) -> None:
+def test_missing_topics_are_named_with_those_that_exist(case, write, refused):
     topics, pieces = MISSING[case]
     path = write(WHEELS, SCANS, [Entry("/lab", "lab_msgs/msg/Custom", TIMES[-1], {})])
     refused(lambda: opened(path, **topics), *pieces)
     refused(lambda: open_recording(RecordingConfig(file=path)), "recording.topics: no odometry", "/odom (nav")
 
 
-def test_frames_that_are_not_connected_are_refused(write: Write, refused: Refused) -> None:
+def test_frames_that_are_not_connected_are_refused(write, refused):
     still = np.zeros((12, 3))
     path = write(framed("odom", "base", still), framed("a", "b", still), [link("base", "laser")], kind="ros1")
     for child, *pieces in (
@@ -99,19 +80,18 @@ STAMPS = {
 @pytest.mark.parametrize("case", STAMPS)
 def test_one_disorder_is_left_out_and_more_are_cured_by_the_bag_time(case, write, refused):
     make, pieces = STAMPS[case]
-    path, told = write(with_stamps(make(2)), kind="sqlite3"), list[str]()
+    path, told = write(with_stamps(make(2)), kind="sqlite3"), []
     refused(lambda: opened(path), *pieces, "(so in 2 of 12", "--set recording.topics.clock=bag")
     assert opened(path, clock="bag").length == 12
     assert opened(write(with_stamps(make(1))), told).length == 11
     assert all(piece in told[0] for piece in (*pieces, "1 of 12 messages are left out"))
 
 
-def test_equal_stamps_and_jumps_are_reported(write: Write, refused: Refused) -> None:
-    told: list[str] = []
+def test_equal_stamps_and_jumps_are_reported(write, refused):
+    told = []
     path = write(with_stamps([*TIMES[:5], *TIMES[4:11]]))
     assert opened(path, told).length == 11
-    (repeated,) = told
-    assert repeated.startswith(f"{path}, /odom: 1 of 12 messages repeat the stamp of the message before, the")
+    assert told[0].startswith(f"{path}, /odom: 1 of 12 messages repeat the stamp of the message before, the")
     path = write(WHEELS, [odometry(TIMES[-1] + STEP, 99.0, 0.0, 0.0)], kind="ros1")
     jump = refused(lambda: opened(path), "message 12: the odometry jumps", "recording.odometry.largest_step=")
     assert "unit" not in str(jump)
@@ -125,7 +105,7 @@ LEAPS = {  # messages from number 6 on are 60 s ahead, by the clock in their hea
 
 
 @pytest.mark.parametrize("leaping", LEAPS)
-def test_a_velocity_does_not_hold_over_a_gap(leaping: str, write: Write, refused: Refused) -> None:
+def test_a_velocity_does_not_hold_over_a_gap(leaping, write, refused):
     """The cure is the other clock where that does not leap; doctor chooses it."""
     used, cure, right = LEAPS[leaping]
     entries = []
@@ -148,7 +128,7 @@ def test_several_publishers_are_named_and_chosen(other, write, refused):
     one = renamed([odometry(time, 0.1 * row, 0, 0) for row, time in enumerate(TIMES)], "odom", "base_link")
     side = 0.0 if agree else 0.5
     two = [odometry(time + STEP // 2, 0.1 * row, side, 0.0) for row, time in enumerate(TIMES)]
-    path, told = write(one, renamed(two, *other), kind="ros1"), list[str]()
+    path, told = write(one, renamed(two, *other), kind="ros1"), []
     pieces = ("/odom, message 1", "odom to base_link (12)", f"{' to '.join(other)} (12)")
     if agree:
         assert opened(path, told).length == 24
@@ -159,7 +139,7 @@ def test_several_publishers_are_named_and_chosen(other, write, refused):
     assert opened(path, odometry={"topic": "/odom", "frames": ["odom", "base_link"]}).length == 12
 
 
-def test_a_frame_that_changes_once_is_cured_by_the_longer_part(write: Write, refused: Refused) -> None:
+def test_a_frame_that_changes_once_is_cured_by_the_longer_part(write, refused):
     found = [odometry(time, 0.1 * row + 0.4 * (row > 7), 0.0, 0.0) for row, time in enumerate(TIMES)]
     path = write(renamed(found[:8], "odom", "base"), renamed(found[8:], "map", "base"), kind="ros1")
     cure = f"recording.to={(TIMES[7] + TIMES[8] - 2 * TIMES[0]) / 2e9:.3f}"
@@ -167,13 +147,12 @@ def test_a_frame_that_changes_once_is_cured_by_the_longer_part(write: Write, ref
     assert opened(path, to=float(cure.split("=")[1])).length == 8
 
 
-def test_numbers_that_cannot_be_are_refused(write: Write, refused: Refused) -> None:
-    bad, told = [odometry(time, np.nan, 0.0, 0.0) for time in TIMES[3:5]], list[str]()
+def test_numbers_that_cannot_be_are_refused(write, refused):
+    bad, told = [odometry(time, np.nan, 0.0, 0.0) for time in TIMES[3:5]], []
     path = write(WHEELS[:3], bad, WHEELS[5:], kind="ros1")
     refused(lambda: opened(path), "/odom, message 3", "the position is nan", "(so in 2 of 12 messages)")
     assert opened(write(WHEELS[:3], bad[:1], WHEELS[4:], kind="sqlite3-message"), told).length == 11
-    assert "message 3" in told[0]
-    assert "1 of 12 messages are left out" in told[0]
+    assert re.search("message 3.*1 of 12 messages are left out", told[0])
     zero = {"header": header(START), "pose": pose(0.0, 0.0, 0.0) | {"orientation": {}}}
     path = write(WHEELS, [Entry("/pose", "geometry_msgs/msg/PoseStamped", START, zero)])
     refused(lambda: opened(path, truth="/pose"), "/pose, message 0", "the orientation is 0, 0, 0, 0")
@@ -182,7 +161,7 @@ def test_numbers_that_cannot_be_are_refused(write: Write, refused: Refused) -> N
     refused(lambda: opened(path, views="/scan"), "half of the ranges are over 5000 m", "views.max_range")
 
 
-def test_topics_without_common_time_are_refused(write: Write, refused: Refused) -> None:
+def test_topics_without_common_time_are_refused(write, refused):
     later = [scan(time + 10**12, np.full(18, 1.0), -1.5, 0.1)._replace(time=time) for time in TIMES]
     path = write(WHEELS, later)
     refused(lambda: opened(path, views="/scan"), "/scan: time is 1700001000.1", "times that overlap")
@@ -190,8 +169,8 @@ def test_topics_without_common_time_are_refused(write: Write, refused: Refused) 
     assert opened(path, views="/scan", clock="bag").length == 12
 
 
-def test_touch_that_does_not_fit_is_refused(write: Write, refused: Refused) -> None:
-    def arrays(values: Sequence[float]) -> list[Entry]:
+def test_touch_that_does_not_fit_is_refused(write, refused):
+    def arrays(values):
         return [Entry("/skin", "std_msgs/msg/Float32MultiArray", time, {"data": values}) for time in TIMES]
 
     touch = {"topic": "/skin", "rows": 2, "columns": 2}
@@ -204,12 +183,12 @@ def test_touch_that_does_not_fit_is_refused(write: Write, refused: Refused) -> N
         refused(lambda path=path: opened(path, touch=touch), *pieces)
     one = arrays([0.0, 1.0, 1.0, 1.0])
     for spoilt_by in ([0.1, 0.2, np.nan, 0.4], [0.1]):
-        one[5], told = arrays(spoilt_by)[5], list[str]()
+        one[5], told = arrays(spoilt_by)[5], []
         seen = opened(write(WHEELS, one), told, touch=touch).seen
         assert (seen.tolist(), len(told)) == ([row != 5 for row in range(12)], 1)
 
 
-def test_empty_and_cut_bags_are_refused(write: Write, tmp_path: Path, refused: Refused) -> None:
+def test_empty_and_cut_bags_are_refused(write, tmp_path, refused):
     for kind in ("ros1", "sqlite3", "mcap"):
         path = write([], kind=kind)
         refused(lambda path=path: opened(path), "a bag without messages")
@@ -227,7 +206,7 @@ def test_empty_and_cut_bags_are_refused(write: Write, tmp_path: Path, refused: R
             refused(action, "a ROS 2 bag that is cut off", "`mcap recover run.mcap")
 
 
-def test_the_parts_of_a_bag_are_one_recording(write: Write, tmp_path: Path) -> None:
+def test_the_parts_of_a_bag_are_one_recording(write, tmp_path):
     """Of ROS 1 in a folder; a storage file without its folder, compressed messages included."""
     (tmp_path / "parts").mkdir()
     for number, part in enumerate((SCANS[6:] + WHEELS[6:], SCANS[:6] + WHEELS[:6])):
@@ -239,7 +218,7 @@ def test_the_parts_of_a_bag_are_one_recording(write: Write, tmp_path: Path) -> N
         assert np.array_equal(opened(file, views="/scan").time, source.time)
 
 
-INDEX: dict[str, dict[str, Any]] = {
+INDEX = {
     "unchunked": {"use_chunking": False},
     "unchunked, out of order": {"use_chunking": False, "disorder": 3},
     "chunks without index": {"index_types": IndexType.NONE},
@@ -252,13 +231,13 @@ INDEX: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("case", INDEX)
-def test_an_mcap_is_read_whole_whatever_its_index(case: str, write: Write, tmp_path: Path) -> None:
+def test_an_mcap_is_read_whole_whatever_its_index(case, write, tmp_path):
     """The mount of the ring is read while the ring is; messages may be stored out of order."""
     options = dict(INDEX[case])
     disorder = options.pop("disorder", 0)
     folder = write(WHEELS, RING, MOUNT)
     with (folder / "run.mcap").open("rb") as old, (tmp_path / "copy.mcap").open("wb") as new:
-        out, ids = Writer(new, chunk_size=2000, **options), dict[int, int]()
+        out, ids = Writer(new, chunk_size=2000, **options), {}
         out.start(profile="ros2", library="test")
         messages = list(make_reader(old).iter_messages())
         for schema, channel, message in [*messages[disorder:], *messages[:disorder]]:
@@ -267,16 +246,15 @@ def test_an_mcap_is_read_whole_whatever_its_index(case: str, write: Write, tmp_p
                 ids[channel.id] = out.register_channel(channel.topic, "cdr", kind, channel.metadata)
             out.add_message(ids[channel.id], message.log_time, message.data, message.publish_time)
         out.finish()
-    told: list[str] = []
+    told = []
     found, right = (opened(path, told, views="/scan") for path in (tmp_path / "copy.mcap", folder))
-    assert np.array_equal(found.time, right.time)
-    assert np.array_equal(found.views, right.views)
+    np.testing.assert_array_equal(found.views, right.views)
     assert found.seen.all()
-    assert told == []
+    assert (found.time.tolist(), told) == (right.time.tolist(), [])
 
 
 @pytest.mark.parametrize("fan", [False, True])
-def test_two_lasers_on_one_topic_have_their_own_mounts(fan: bool, write: Write) -> None:
+def test_two_lasers_on_one_topic_have_their_own_mounts(fan, write):
     """One looks ahead, the other back; an unknown mount is told once."""
     front, rear = [link("base_link", "laser")], [link("base_link", "rear", np.pi)]
     ranges, scans = np.linspace(1, 4, 36), []
@@ -287,14 +265,14 @@ def test_two_lasers_on_one_topic_have_their_own_mounts(fan: bool, write: Write) 
     span = {"topic": "/scan", "span": [-np.pi, np.pi]} if fan else "/scan"
     inside = slice(9, 13) if fan else slice(None)
     for known in (True, False):
-        told: list[str] = []
+        told = []
         one, two = opened(write(WHEELS, front, rear * known, scans), told, views=span).views[:2]
         assert len(told) == (not known)
         assert known or "no transform from base_link to rear" in told[0]
         assert np.allclose(one.ravel()[inside], two.ravel()[inside]) == known
 
 
-METADATA: dict[str, tuple[str, str, str | None]] = {
+METADATA = {
     "more than there are": ("message_count: 12", "message_count: 15", "12 of 15 messages were read"),
     "fewer": ("message_count: 12", "message_count: 3", None),
     "none": ("message_count: 12", "message_count: 0", None),
@@ -304,9 +282,9 @@ METADATA: dict[str, tuple[str, str, str | None]] = {
 
 
 @pytest.mark.parametrize("case", METADATA)
-def test_what_is_not_read_is_said(case: str, write: Write) -> None:
+def test_what_is_not_read_is_said(case, write):
     old, new, expected = METADATA[case]
-    folder, told = write(WHEELS, SCANS, kind="sqlite3"), list[str]()
+    folder, told = write(WHEELS, SCANS, kind="sqlite3"), []
     text = (folder / "metadata.yaml").read_text()
     assert old in text
     (folder / "metadata.yaml").write_text(text.replace(old, new))
@@ -329,31 +307,26 @@ def test_other_containers_are_named(profile, encoding, schema, tmp_path, refused
         kind = out.register_schema("nav_msgs/msg/Odometry", schema, b"{}")
         out.add_message(out.register_channel("/odom", encoding, kind), 1, b"{}", 1)
         out.finish()
+    pieces = f"of profile {profile or 'none'} with", encoding, "rosbags-conv"
     for read in (opened, describe_bag):
-        refused(
-            lambda read=read: read(path), f"of profile {profile or 'none'} with", encoding, "rosbags-conv"
-        )
+        refused(lambda read=read: read(path), *pieces)
 
 
-SPOILT: dict[str, dict[str, Any]] = {
-    "angles": {"angle_increment": np.nan},
-    "beams": {"ranges": np.zeros(0, np.float32)},
-    "few": {"ranges": np.ones(5, np.float32)},
-}
+SPOILT = {"angles": {"angle_increment": np.nan}, "beams": {"ranges": np.zeros(0, np.float32)},
+          "few": {"ranges": np.ones(5, np.float32)}}  # fmt: skip
 
 
-def spoilt(case: str, number: int) -> Entry:
+def spoilt(case, number):
     return RING[number]._replace(fields=dict(RING[number].fields) | SPOILT[case])
 
 
 @pytest.mark.parametrize("number", [0, 7])
 @pytest.mark.parametrize("case", [*SPOILT, "cut", "zero turn", "nan turn"])
-def test_one_bad_message_is_left_out(case: str, number: int, write: Write) -> None:
-    ring, links, told = list(RING), MOUNT * 2, list[str]()
+def test_one_bad_message_is_left_out(case, number, write):
+    ring, links, told = list(RING), MOUNT * 2, []
     if case.endswith("turn"):
-        links[number > 0] = link("base_link", "laser")
-        turn = links[number > 0].fields["transforms"][0]["transform"]["rotation"]
-        turn["w"] = 0.0 if case == "zero turn" else np.nan
+        links[number > 0] = bad = link("base_link", "laser")
+        bad.fields["transforms"][0]["transform"]["rotation"]["w"] = 0.0 if case == "zero turn" else np.nan
     elif case != "cut":
         ring[number] = spoilt(case, number)
     path = write(links, WHEELS, ring, kind="sqlite3")
@@ -375,8 +348,6 @@ def test_one_bad_message_is_left_out(case: str, number: int, write: Write) -> No
     assert views == ({"topic": "/scan", "span": [-3.1416, 3.1416]} if few else "/scan")
 
 
-def test_many_bad_messages_are_refused(write: Write, refused: Refused) -> None:
+def test_many_bad_messages_are_refused(write, refused):
     path = write(WHEELS, [spoilt("angles", 0), spoilt("angles", 1), *RING[2:]])
-    refused(
-        lambda: opened(path, views="/scan"), "/scan, message 0, at", "angle_min is", "(so in 2 of 12 mess"
-    )
+    refused(lambda: opened(path, views="/scan"), "/scan, message 0, at", "angle_min is", "(so in 2 of 12")
