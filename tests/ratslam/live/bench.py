@@ -35,32 +35,25 @@ SLACK = {"patience": 5.0, "silence": 2.0, "replug": 20.0, "stuck": 0.8}
 
 
 class Bench:
-    """An emulated arm and head at an address, started when needed and again after they ended."""
+    """An emulated arm and head at an address, by their faults; started when needed, and again after they
+    ended."""
+
+    arm: Faults
+    head: Faults
 
     def __init__(self, host: str, server: SessionServer, folder: Path) -> None:
         self.host, self._server, self._folder = host, server, folder
         self._arm, self._head = ExitStack(), ExitStack()
-        self._faults: dict[str, Faults] = {}
         self.starved = 0  # number of stops by the controller's watchdog before the test
-
-    @property
-    def arm(self) -> Faults:
-        """Faults of the controller."""
-        return self._faults["arm"]
-
-    @property
-    def head(self) -> Faults:
-        """Faults of the head."""
-        return self._faults["head"]
 
     def ready(self) -> None:
         """Clears the faults of both devices and places the tool at `START`."""
         if not self._runs("arm"):
             self._arm.close()
-            self._faults["arm"] = self._arm.enter_context(ur_emulator(self.host, START))
+            self.arm = self._arm.enter_context(ur_emulator(self.host, START))
         if not self._runs("head"):
             self._head.close()
-            self._faults["head"] = self._head.enter_context(self._a_head())
+            self.head = self._head.enter_context(self._a_head())
             raise_priority(self.head.process.pid)
         self.arm(do="clear")
         self.arm(do="wall")
@@ -78,11 +71,7 @@ class Bench:
     def session(
         self, mapper: float | None = 0.0, order: dict[str, Any] | None = None, **settings: Any
     ) -> AbstractContextManager[Session]:
-        """A quick session, started; its processes end with the block.
-
-        Args:
-            mapper, order: see `SessionServer.session`. settings: of the section `live`.
-        """
+        """A quick session with settings of the section `live`, started; see `SessionServer.session`."""
         return self._server.session({"live": self.quick(**settings)}, mapper=mapper, **order or {})
 
     @contextmanager
@@ -105,15 +94,13 @@ class Bench:
                 "whisking": {"rate": 4.0}, "calibration": {"min_duration": 1.0}, "motion": {"speed": 0.05}
             },
         }  # fmt: skip
-        given = {name: value | settings.pop(name, {}) for name, value in parts.items()}
-        return usual | given | settings
+        return usual | {name: value | settings.pop(name, {}) for name, value in parts.items()} | settings
 
     def moment(self) -> Moment:
         """The present time by the devices' clocks."""
         return Moment(self.arm.state()["time"], self.head.state()["sequence"])
 
     def still(self) -> bool:
-        """Whether the arm stands."""
         return not self.arm.state()["moving"]
 
     def moves(self) -> bool:
@@ -152,12 +139,11 @@ class Bench:
         self._head.close()
 
     def _runs(self, name: str) -> bool:
-        return name in self._faults and self._faults[name].process.poll() is None
+        return hasattr(self, name) and getattr(self, name).process.poll() is None
 
     def _a_head(self) -> AbstractContextManager[Faults]:
         config = self._folder / "head.json"
-        made = HeadEmulatorConfig(host=self.host, arm=self.host, placing=HIGH)
-        config.write_text(made.model_dump_json())
+        config.write_text(HeadEmulatorConfig(host=self.host, arm=self.host, placing=HIGH).model_dump_json())
         return emulator("robot.emulators.head", HEAD_FAULTS, self.host, "--config", str(config))
 
 
@@ -190,7 +176,6 @@ class CreateBench:
         self.robot("plug")
 
     def runs(self) -> bool:
-        """Whether the emulator runs."""
         return hasattr(self, "whiskers") and self.whiskers.process.poll() is None
 
     def close(self) -> None:
@@ -202,11 +187,9 @@ class CreateBench:
         return self.whiskers(device="create", do=do, **request)
 
     def state(self) -> dict[str, Any]:
-        """State of the robot."""
         return self.robot("state")
 
     def rolls(self) -> bool:
-        """Whether a wheel turns."""
         return any(self.state()["wheels"])
 
     def stopped_after(self, moment: float = 0.0) -> float:

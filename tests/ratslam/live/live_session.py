@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,8 +20,6 @@ from robot.recordings.mcap_reader import McapScanner
 from robot.sources.source import Sample
 from tests.helpers.live import PATIENCE, ROOT, until
 
-SAMPLES = 2000.0
-"""Frames of the head in a second."""
 CODES = {"complete": (0,), "interrupted": (130, 143)}
 """Exit codes of outcomes; that of all others is 2."""
 
@@ -35,8 +32,6 @@ class Moment(NamedTuple):
 
 
 class RecordedData(NamedTuple):
-    """Content of a recording."""
-
     sequence: np.ndarray
     robot: np.ndarray
     samples: list[Sample]
@@ -45,7 +40,7 @@ class RecordedData(NamedTuple):
 
     def lost(self, until: Moment) -> float:
         """Duration of the data missing at the end of the recording, of either device, s."""
-        return max(until.robot - float(self.robot[-1]), (until.sample - int(self.sequence[-1])) / SAMPLES)
+        return max(until.robot - float(self.robot[-1]), (until.sample - int(self.sequence[-1])) / 2000)
 
     def names(self) -> list[str]:
         return [event.name for event in self.events]
@@ -54,17 +49,13 @@ class RecordedData(NamedTuple):
 def read_recorded(path: Path) -> RecordedData:
     """Reads a recording, complete or not."""
     walk = McapScanner(path)
-    sequence, robot, samples, events = [], [], [], []
-    for entry in walk.entries():
-        if isinstance(entry.content, Frames):
-            sequence.append(entry.content.sequence)
-        elif isinstance(entry.content, np.ndarray):
-            robot.append(entry.content["robot"])
-        elif isinstance(entry.content, Event):
-            events.append(entry.content)
-        else:
-            samples.append(entry.content)
-    return RecordedData(np.concatenate(sequence), np.concatenate(robot), samples, events, walk.broken)
+    content = [entry.content for entry in walk.entries()]
+    frames, states, samples, events = (
+        [part for part in content if isinstance(part, kind)] for kind in (Frames, np.ndarray, Sample, Event)
+    )
+    sequence = np.concatenate([part.sequence for part in frames])
+    robot = np.concatenate([part["robot"] for part in states])
+    return RecordedData(sequence, robot, samples, events, walk.broken)
 
 
 def raise_priority(pid: int) -> None:
@@ -104,11 +95,7 @@ class Session:
             assert found or not self.ended(), self.output()
             return found
 
-        try:
-            return until(met, what, 4 * PATIENCE)
-        except AssertionError:
-            print(self.output())
-            raise
+        return until(met, what, 4 * PATIENCE)
 
     def wait_for(self, text: str) -> None:
         """Waits for a text in its output."""
@@ -119,10 +106,8 @@ class Session:
         until(self.ended, f"the session ends\n{self.output()}", seconds)
         return int(self._code.read_text())
 
-    def report(self) -> dict[str, Any]:
-        """Content of `live.json`."""
-        report: dict[str, Any] = json.loads((self.directory / "live.json").read_text())
-        return report
+    def report(self) -> Any:
+        return json.loads((self.directory / "live.json").read_text())
 
     def ends(self, outcome: str) -> dict[str, Any]:
         """The report of a session that ends by itself with an outcome."""
@@ -133,25 +118,12 @@ class Session:
         assert "Traceback" not in self.output(), self.output()
         return report
 
-    def is_refused(self, *texts: str) -> None:
-        """Checks that it ends with an error that has these texts, before there is a run directory."""
-        assert self.code() == 2, self.output()
-        assert "Traceback" not in self.output(), self.output()
-        for text in texts:
-            assert text in self.output()
-        assert not self.directory.exists()
-
     def recorded(self) -> RecordedData:
-        """Content of its recording."""
         return read_recorded(self.directory / "session.mcap")
 
     def child(self, word: bytes) -> int:
         """Process id of its child that has a word in its command line."""
         return child_of(self.pid, word)
-
-    def mapper(self) -> int:
-        """Process id of its mapper."""
-        return self.child(b"spawn_main")
 
     def lives(self) -> bool:
         """Whether any of its processes runs; a zombie does not."""
@@ -162,11 +134,10 @@ class Session:
                     return True
         return False
 
-    def send(self, number: int) -> float:
-        """Sends a signal to its process, unless it has ended; returns the time, s, host."""
+    def send(self, number: int) -> None:
+        """Sends a signal to its process, unless it has ended."""
         with suppress(ProcessLookupError):
             os.kill(self.pid, number)
-        return time.monotonic()
 
     def send_to_all(self, number: int) -> None:
         """Sends a signal to all of its processes."""
@@ -189,20 +160,18 @@ class SessionServer:
     def session(
         self, config: dict[str, Any], options: Sequence[str] = (), mapper: float | None = 0.0, **order: Any
     ) -> Iterator[Session]:
-        """A session, started; its processes end with the block.
+        """A session, started with more options of `live`; its processes end with the block.
 
         Args:
-            config: its configuration. options: more of `live`. mapper: s that the stub takes for each
-                sample; None: no stub, the mapper itself.
-            order: `rate_check`: whether it listens to the head for as long as in use and checks its rate;
-                `environment`: variables.
+            mapper: s that the stub takes for each sample; None: no stub, the mapper itself.
+            order: `rate_check`: whether it checks the head's rate; `environment`: variables.
         """
         self._count += 1
         folder = self._folder / str(self._count)
         folder.mkdir()
-        file, log = folder / "config.yaml", folder / "log"
+        file = folder / "config.yaml"
         file.write_text(json.dumps(config))
-        log.touch()
+        (folder / "log").touch()
         arguments = ["live", str(file), "-o", str(folder / "run"), *options]
         order = {"environment": {}, "rate_check": False} | order
         order |= {"folder": str(folder), "arguments": arguments, "mapper": mapper}

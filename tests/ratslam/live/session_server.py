@@ -23,15 +23,9 @@ from pathlib import Path
 from typing import Any
 
 LOADED = (
-    "ratslam.cli.live",
-    "ratslam.live.live_session",
-    "ratslam.live.mapper_process",
-    "robot.live.whisk_loop",
-    "robot.drivers.head.emulated_cable",
-    "evaluation.metrics.scorecard",
-    "usb.core",
-    "usb.util",
-)
+    "ratslam.cli.live", "ratslam.live.live_session", "ratslam.live.mapper_process", "robot.live.whisk_loop",
+    "robot.drivers.head.emulated_cable", "evaluation.metrics.scorecard", "usb.core", "usb.util",
+)  # fmt: skip
 """Modules that a session loads."""
 
 
@@ -44,8 +38,7 @@ def main() -> None:
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
         if not _fork():
-            order = json.loads(line)
-            session = _fork()
+            order, session = json.loads(line), _fork()
             if not session:
                 _become_session(order, Path(order["folder"]))
             print(session, flush=True)
@@ -94,10 +87,6 @@ def _become_session(order: dict[str, Any], folder: Path) -> None:
         os._exit(code)
 
 
-SHORT = 64
-"""Bytes; shorter messages are not samples."""
-
-
 class Answer:
     """A stub's answer; pickles as `ratslam.live.mapper_process.MappedSample`, without importing it here."""
 
@@ -118,11 +107,7 @@ def result_of(number: int, seconds: float) -> Any:
 
 
 def map_nothing(directory: str, seconds: float, line: Connection) -> None:
-    """Stub of the mapper's main function: follows its protocol without mapping and loads almost nothing.
-
-    Args:
-        directory: of the run, which it makes. seconds: for each sample.
-    """
+    """Stub of the mapper's main function: follows its protocol without mapping and loads almost nothing."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         line.recv_bytes()  # the job
@@ -133,7 +118,7 @@ def map_nothing(directory: str, seconds: float, line: Connection) -> None:
         number = 0
         while True:
             word = line.recv_bytes()
-            if len(word) < SHORT and isinstance(pickle.loads(word), bool):
+            if len(word) < 64 and isinstance(pickle.loads(word), bool):  # samples are longer
                 return  # without a score
             time.sleep(seconds)
             line.send(Answer(number, seconds))

@@ -102,55 +102,24 @@ def test_a_collision_with_a_wall(bench: Bench) -> None:
         assert state["tcp"][0] == pytest.approx(touched + state["penetration_max"] - 0.01, abs=0.0015)
 
 
-def test_a_slow_mapper_drops_images_and_no_odometry(bench: Bench) -> None:
-    with bench.session(mapper=0.55, budget=0.3, whisks=10) as session:
-        report, recorded = bench.ended(session, "complete")
-        assert report["standing"]
-        assert report["whisks"] == 10
-        assert 3 <= report["dropped"] <= 9
-        assert recorded.names().count("dropped") == report["dropped"]
-        seen = [len(sample.reading.time) > 0 for sample in recorded.samples]
-        assert seen.count(False) == report["dropped"]
-        assert seen[0]
-        recording = Recording(session.directory / "session.mcap")
-        assert recording.length == 10
-        for sample, again in zip(recorded.samples, recording, strict=True):
-            assert (sample.time, sample.reading.odometry) == (again.time, again.reading.odometry)
-            assert len(sample.reading.time) == len(again.reading.time)
-        # The whole path is recorded: the arm's odometry has no errors here.
-        x = np.cumsum([sample.reading.odometry.dx for sample in recorded.samples])
-        truth = np.array([sample.truth[0] for sample in recorded.samples])
-        np.testing.assert_allclose(x - x[0], truth - truth[0], atol=1e-6)
-        assert x[-1] > 0.05
-
-
-def gaps(recorded: RecordedData) -> int:
-    """Frames that are missing between the first and the last one of a recording."""
-    known = np.unique(recorded.sequence)
-    return int(known[-1] - known[0] + 1 - len(known))
-
-
 @pytest.mark.parametrize(
-    "fault",
-    [
-        {"do": "unplug"},
-        {"do": "stall", "seconds": 2.5},
-        soak({"do": "silence", "seconds": 2.5}),
-    ],
-    ids=lambda fault: fault["do"],
+    "faults",
+    [[{"do": "unplug"}, {"do": "stall", "seconds": 2.5}], soak([{"do": "silence", "seconds": 2.5}])],
+    ids=["unplug, stall", "silence"],
 )
-def test_the_session_continues_when_the_head_is_back(bench: Bench, fault: dict) -> None:
-    leg = LEGS[0], LEGS[3]  # of 4.2 s, so that the head's silence ends the motion before the leg ends
+def test_the_session_continues_when_the_head_is_back(bench: Bench, faults: list[dict]) -> None:
+    leg = LEGS[0], LEGS[5]  # of 7 s, so that the head's silence ends the motion before the leg ends
     with bench.in_motion(head={"silence": 1.0}, waypoints=leg) as session:
-        bench.head(**fault)
-        until(bench.still, "the arm stands")
-        bench.head(do="plug")
+        for fault in faults:
+            session.until(bench.moves, "the arm moves")
+            bench.head(**fault)
+            until(bench.still, "the arm stands")
+            bench.head(do="plug")
         report, recorded = bench.ended(session, "complete")
         assert report["standing"]
-        names = [name for name in recorded.names() if name != "dropped"]
-        assert names == ["held", "resumed"]
-        assert report["head"]["restarts"] == (fault["do"] == "unplug")
-        assert (report["head"]["stalls"] > 0) == (fault["do"] == "stall")
+        assert [name for name in recorded.names() if name != "dropped"] == ["held", "resumed"] * len(faults)
+        assert report["head"]["restarts"] == sum(fault["do"] == "unplug" for fault in faults)
+        assert (report["head"]["stalls"] > 0) == any(fault["do"] == "stall" for fault in faults)
         assert len(recorded.samples) == report["whisks"]
         goal = START[:2] + np.subtract(leg[1][:2], leg[0][:2])
         np.testing.assert_allclose(bench.arm.state()["tcp"][:2], goal, atol=1e-3)
@@ -161,10 +130,9 @@ def test_the_session_continues_when_the_head_is_back(bench: Bench, fault: dict) 
         assert travelled == pytest.approx(way, abs=1e-6)
 
 
-def test_damaged_and_lost_frames_are_counted(bench: Bench) -> None:
-    """Exact counts of damaged, skipped and swapped frames, of garbage and of an overrun; the session
-    continues."""
-    with bench.in_motion(whisks=16) as session:
+def test_a_slow_mapper_drops_images_damage_is_counted_and_no_odometry_is_lost(bench: Bench) -> None:
+    """Exact counts of damaged, skipped and swapped frames, of garbage and of an overrun."""
+    with bench.in_motion(mapper=0.55, budget=0.3, whisks=16) as session:
         before = bench.head(do="counts")
         bench.head(do="corrupt", frames=7)
         bench.head(do="garbage", bytes=100_000)
@@ -174,16 +142,32 @@ def test_damaged_and_lost_frames_are_counted(bench: Bench) -> None:
         session.until(lambda: whisk_count(session) > seen, "the damage is read")
         bench.head(do="silence", seconds=2.4)  # more than its FIFO holds
         report, recorded = bench.ended(session, "complete")
-        lost = bench.head(do="counts")["lost"] - before["lost"]
-        counts = report["head"]
+        lost, counts = bench.head(do="counts")["lost"] - before["lost"], report["head"]
         assert lost > 100
         assert counts["bad"] >= 7  # random bytes may spell the magic
         assert counts["skipped_bytes"] == 7 * 128 + 100_000
         assert counts["duplicates"] == counts["restarts"] == 0
         assert counts["overruns"] >= 1
-        assert counts["missing"] == gaps(recorded) == 37 + lost
+        known = np.unique(recorded.sequence)
+        assert counts["missing"] == known[-1] - known[0] + 1 - len(known) == 37 + lost
         assert report["missing"] >= 37 + lost  # and frames that arrived too late
-        assert report["dropped"] == recorded.names().count("dropped") >= 1
+        assert report["standing"]
+        assert report["whisks"] == 16
+        assert 4 <= report["dropped"] <= 15
+        assert recorded.names().count("dropped") == report["dropped"]
+        shown = [len(sample.reading.time) > 0 for sample in recorded.samples]
+        assert shown.count(False) == report["dropped"]
+        assert shown[0]
+        recording = Recording(session.directory / "session.mcap")
+        assert recording.length == 16
+        for sample, again in zip(recorded.samples, recording, strict=True):
+            assert (sample.time, sample.reading.odometry) == (again.time, again.reading.odometry)
+            assert len(sample.reading.time) == len(again.reading.time)
+        # The whole path is recorded: the arm's odometry has no errors here.
+        x = np.cumsum([sample.reading.odometry.dx for sample in recorded.samples])
+        truth = np.array([sample.truth[0] for sample in recorded.samples])
+        np.testing.assert_allclose(x - x[0], truth - truth[0], atol=1e-6)
+        assert x.max() > 0.05
 
 
 def test_an_overloaded_whisker_ends_the_session(bench: Bench) -> None:
@@ -210,8 +194,7 @@ def recovered(session: Session) -> RecordedData:
 def test_a_killed_session_stops_the_arm_and_loses_little(bench: Bench, number: int, whole: bool) -> None:
     """All of its processes, whose arm the controller's watchdog stops, or the parent alone."""
     within, lost = (STRICT, STRICT) if number else (PATIENCE, LOST)
-    watchdog = {"watchdog_hz": 10.0 if number else 0.5} if whole else {}
-    with bench.in_motion(arm=watchdog) as session:
+    with bench.in_motion(arm={"watchdog_hz": 10.0 if number else 0.5} if whole else {}) as session:
         time.sleep(float(stream(number, "killed").uniform(0.0, 1.4)))
         at = bench.moment()
         (session.send_to_all if whole else session.send)(signal.SIGKILL)
@@ -227,9 +210,8 @@ def test_a_killed_session_stops_the_arm_and_loses_little(bench: Bench, number: i
     until(lambda: bench.head.state()["resting"], "the whiskers are retracted")
 
 
-@pytest.mark.parametrize(("sent", "code_of"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize("number", [0, *map(soak, range(1, 52))])
-def test_an_interrupt_ends_the_session(bench: Bench, number: int, sent: int, code_of: int) -> None:
+@pytest.mark.parametrize(("number", "sent"), [(0, 2), *(soak(k, n) for k in range(52) for n in (2, 15))])
+def test_an_interrupt_ends_the_session(bench: Bench, number: int, sent: int) -> None:
     """At any moment, sent to all of its processes: a controlled stop, and a complete recording up to then."""
     with bench.session(waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)]) as session:
         session.wait_for("disk:")
@@ -242,11 +224,11 @@ def test_an_interrupt_ends_the_session(bench: Bench, number: int, sent: int, cod
         assert "Traceback" not in session.output()
         if session.directory.exists() and (session.directory / "session.mcap").exists():
             outcome = session.report()["outcome"]
-            assert (outcome, code) in {("interrupted", code_of), ("complete", 0)}
+            assert (outcome, code) in {("interrupted", 128 + sent), ("complete", 0)}
             if outcome == "interrupted":
                 bench.ended(session, outcome, at)
         else:
-            assert code == code_of
+            assert code == 128 + sent
             assert "interrupted" in session.output()
             assert "recording" not in session.output()
         assert bench.arm.state()["watchdog_stops"] == bench.starved
@@ -256,17 +238,17 @@ def test_a_second_interrupt_stops_the_arm_by_the_dashboard(bench: Bench) -> None
     """The second interrupt waits for the arm only."""
     with bench.in_motion() as session:
         for _ in range(3):  # the third is ignored
-            session.send(signal.SIGINT)
+            session.send(signal.SIGTERM)
             time.sleep(0.005)
-        assert session.code() == 130
+        assert session.code() == 143
         assert "Traceback" not in session.output()
         bench.stands()
         until(lambda: bench.arm.state()["runtime"] == "STOPPED", "its program is ended")
         recovered(session)
 
 
-def test_interrupts_while_it_finishes_leave_the_report(bench: Bench) -> None:
-    with bench.session(mapper=None, whisks=4) as session:
+def test_interrupts_while_its_mapper_finishes_leave_the_report(bench: Bench) -> None:
+    with bench.session(mapper=0.5, whisks=4) as session:
         session.wait_for("4/4")
         for _ in range(3):
             session.send(signal.SIGINT)
@@ -278,10 +260,14 @@ def test_interrupts_while_it_finishes_leave_the_report(bench: Bench) -> None:
         until(lambda: not session.lives(), "nothing of it stays")
 
 
-@pytest.mark.parametrize("number", [0, *map(soak, range(1, 31))])
+@pytest.mark.parametrize("number", [1, soak(0), *map(soak, range(2, 32))])
 def test_a_killed_session_is_mapped_again_to_the_same_bits(bench: Bench, number: int, tmp_path: Path) -> None:
-    """With its mapper, or alone: the mapper then completes the run."""
-    with bench.session(mapper=None, waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)] * 3) as session:
+    """With its mapper, or alone: the mapper then completes the run. Of the latter, some are localised in a
+    map, which stays as it is."""
+    map_file = ROOT / "tests" / "data" / "maps" / "ratslam-map-1.npz"
+    before, again = map_file.read_bytes(), tmp_path / "again"
+    order = {"options": ["--localise", str(map_file)] if number % 4 == 1 else []}
+    with bench.session(None, order, waypoints=[(0.63, 0.45, 0.0), (0.7, 0.45, 0.0)] * 3) as session:
         session.wait_for("armed")
         time.sleep(float(stream(number, "mapped").uniform(0.0, 8.0)))
         (session.send if number % 2 else session.send_to_all)(signal.SIGKILL)
@@ -290,39 +276,26 @@ def test_a_killed_session_is_mapped_again_to_the_same_bits(bench: Bench, number:
         recorded, mapped = session.recorded(), (live / "online.tum").read_text()
         assert recorded.broken in ("", UNCLOSED)  # "": it was complete
         assert len(recorded.samples) >= mapped.count("\n")
+        names = ["online.tum", "odometry.tum", "steps.csv", *["localisation.csv"] * (number % 4 == 1)]
         if recorded.samples:
-            assert main(["run", str(live / "config.yaml"), "-o", str(tmp_path / "again")]) == 0
-            for name in ("online.tum", "odometry.tum", "steps.csv"):
-                assert (tmp_path / "again" / name).read_text().startswith((live / name).read_text())
+            assert main(["run", str(live / "config.yaml"), "-o", str(again)]) == 0
+            for name in names:
+                assert (again / name).read_text().startswith((live / name).read_text()), name
+        if names[3:] and len(recorded.samples) > 1:
+            # The emulated head is too low for its whiskers to touch walls, so there is nothing to find it by.
+            rows = list(csv.DictReader((again / "localisation.csv").read_text().splitlines()))
+            assert [row["state"] for row in rows] == ["searching"] * len(recorded.samples)
+            assert float(rows[-1]["sd"]) > float(rows[0]["sd"])
         print(f"{len(recorded.samples)} samples recorded, {mapped.count(chr(10))} mapped live")
+    assert map_file.read_bytes() == before
 
 
 def test_the_disk_is_full(bench: Bench) -> None:
     with bench.in_motion() as session:
-        at = bench.moment()
-        size = (session.directory / "session.mcap").stat().st_size
+        at, size = bench.moment(), (session.directory / "session.mcap").stat().st_size
         resource.prlimit(session.pid, resource.RLIMIT_FSIZE, (size + 5000, size + 5000))
-        code = session.code()
-        assert code == 2
+        assert session.code() == 2
         assert "disk_full: " in session.output()
         assert "Traceback" not in session.output()
         bench.stands()
-        saved = recovered(session)
-        assert saved.lost(at) <= LOST
-
-
-def test_a_session_is_localised_and_its_replay_gives_the_same_bits(bench: Bench, tmp_path: Path) -> None:
-    map_file = ROOT / "tests" / "data" / "maps" / "ratslam-map-1.npz"
-    before = map_file.read_bytes()
-    with bench.session(None, {"options": ["--localise", str(map_file)]}, whisks=6) as session:
-        session.ends("complete")
-        live = session.directory
-        with (live / "localisation.csv").open() as file:
-            rows = list(csv.DictReader(file))
-        # The emulated head is too low for its whiskers to touch walls, so there is nothing to find it by.
-        assert [row["state"] for row in rows] == ["searching"] * 6
-        assert float(rows[-1]["sd"]) > float(rows[0]["sd"])
-        assert main(["run", str(live / "config.yaml"), "-o", str(tmp_path / "again")]) == 0
-        for name in ("localisation.csv", "steps.csv", "trajectory.tum"):
-            assert (live / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
-    assert map_file.read_bytes() == before
+        assert recovered(session).lost(at) <= LOST

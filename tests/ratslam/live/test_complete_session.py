@@ -11,14 +11,11 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ratslam.examples import dead_reckoning
-from tests.helpers.distributions import install
 from tests.helpers.live import HEAD_FAULTS, ROOT, UR_FAULTS, started, until
 from tests.ratslam.live.live_session import child_of, raise_priority, read_recorded
 
@@ -41,14 +38,7 @@ PATIENT = (
     "live.residual=1", "live.room=0",
 )  # fmt: skip
 """Long time-outs: emulators and session share a busy machine."""
-SHORT = (*PATIENT, "live.plan.whisking.rate=2", "live.budget=3", "live.plan.calibration.min_duration=2")
-
-
-def _begun(session: subprocess.Popen, log: Path) -> bool:
-    """Whether its progress bar shows at least three whisks; fails when it has ended."""
-    output = log.read_text()
-    assert session.poll() is None, output
-    return any(int(done) >= 3 for done in re.findall(r"(\d+)/\d+ \[", output))
+SHORT = (*PATIENT, "live.plan.whisking.rate=2", "live.budget=1.5", "live.plan.calibration.min_duration=2")
 
 
 def complete_session(
@@ -60,12 +50,8 @@ def complete_session(
     options: Sequence[str] = (),
     outcome: str = "complete",
 ) -> Path:
-    """The run directory of a session that ends as planned, on emulators of its own.
-
-    Args:
-        longest: s that it may take. freeze: s for which its mapper is stopped on the way.
-        options: more of `live`.
-    """
+    """The run directory of a session that ends as planned within `longest` s, on emulators of its own; with
+    more options of `live`, and its mapper stopped for `freeze` s on the way."""
     given = [word for setting in settings for word in ("--set", setting)]
     directory, log = folder / "live", folder / "log"
     hosts = [CONFIG, "--host", host, "--ur-host", host]
@@ -81,8 +67,14 @@ def complete_session(
         )  # fmt: skip
         for pid in (arm.process.pid, head.process.pid, process.pid):
             raise_priority(pid)
+
+        def begun() -> bool:
+            """Whether its progress bar shows at least three whisks; fails when it has ended."""
+            assert process.poll() is None, log.read_text()
+            return any(int(done) >= 3 for done in re.findall(r"(\d+)/\d+ \[", log.read_text()))
+
         try:
-            if freeze and until(partial(_begun, process, log), "the third whisk"):
+            if freeze and until(begun, "the third whisk"):
                 mapper = child_of(process.pid, b"spawn_main")
                 os.kill(mapper, signal.SIGSTOP)
                 time.sleep(freeze)
@@ -97,24 +89,17 @@ def complete_session(
         assert "clocks: head" in output, "the self-test has found the head's rate"
         assert "Traceback" not in output
         state = arm.state()
-        assert not state["moving"]
-        assert state["watchdog_stops"] == 0
+        assert (state["moving"], state["watchdog_stops"]) == (False, 0)
         assert head(do="counts")["lost"] == 0
     return directory
 
 
-def check_session(directory: Path, whisks: int, same: Sequence[str] = SAME) -> dict:
-    """The report of a session; checks that nothing was lost and that the replay is identical.
-
-    Args:
-        same: files of the run directory to compare.
-    """
+def check_session(directory: Path, whisks: int) -> dict:
+    """The report of a session; checks that nothing was lost and that the replay has the same files."""
     report = json.loads((directory / "live.json").read_text())
     print(json.dumps(report, indent=1))
-    assert report["outcome"] == "complete"
-    assert report["standing"]
-    assert report["whisks"] == whisks
-    assert report["missing"] == 0
+    found = [report[name] for name in ("outcome", "standing", "whisks", "missing")]
+    assert found == ["complete", True, whisks, 0]
     faults = {name: count for name, count in report["head"].items() if name != "good"}
     assert set(faults.values()) == {0}, faults
     recorded = read_recorded(directory / "session.mcap")
@@ -129,7 +114,7 @@ def check_session(directory: Path, whisks: int, same: Sequence[str] = SAME) -> d
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "[]", "the replay loads what only live sessions need"
-    for name in same:
+    for name in SAME:
         assert (directory / name).read_bytes() == (again / name).read_bytes(), name
     assert len((directory / "steps.csv").read_text().splitlines()) == whisks + 1
     return report
@@ -138,24 +123,18 @@ def check_session(directory: Path, whisks: int, same: Sequence[str] = SAME) -> d
 def test_a_session_and_its_replay(loopback: str, tmp_path: Path) -> None:
     """The mapper is stopped for a while: images dropped live are dropped in the replay too. A view changes
     nothing."""
-    settings = [*SHORT, "live.whisks=14"]
-    view = tmp_path / "view.rrd"
-    directory = complete_session(
-        loopback, tmp_path, *settings, longest=280, freeze=4.5, options=["--rerun", str(view)]
-    )
-    report = check_session(directory, 14)  # the replay has no view
-    assert 1 <= report["dropped"] < 14
-    # The view is the last to get processor time: on a busy machine it may be late, but then this is said.
-    assert "did not keep up" in (tmp_path / "log").read_text() or shown_steps(view) == 14
-
-
-def shown_steps(view: Path) -> int:
-    """Number of robot poses in the file of a live view."""
     from rerun.chunk import RrdReader
 
+    view, settings = tmp_path / "view.rrd", [*SHORT, "live.whisks=10"]
+    options = ["--rerun", str(view)]
+    directory = complete_session(loopback, tmp_path, *settings, longest=280, freeze=3.0, options=options)
+    report = check_session(directory, 10)  # the replay has no view
+    assert 1 <= report["dropped"] < 10
     chunks = RrdReader(view).stream().collect().stream()
     robot = [chunk for chunk in chunks if chunk.entity_path == "/world/robot" and not chunk.is_static]
-    return sum(chunk.num_rows for chunk in robot)
+    # The view is the last to get processor time: on a busy machine it may be late, but then this is said.
+    late = "did not keep up" in (tmp_path / "log").read_text()
+    assert late or sum(chunk.num_rows for chunk in robot) == 10
 
 
 @pytest.mark.soak
@@ -168,16 +147,3 @@ def test_ten_minutes_and_their_replay(loopback: str, tmp_path: Path, hz: int) ->
     assert report["lateness_s"]["p99"] <= 0.05
     assert report["state_age_s"]["p99"] <= 0.02
     assert report["mapper_s"]["p99"] <= 0.6
-
-
-@pytest.mark.soak
-def test_a_backend_of_another_package_maps_live(loopback: str, tmp_path: Path, monkeypatch) -> None:
-    """The mapper process finds its entry point; the replay gives the same bits."""
-    module = Path(dead_reckoning.__file__).read_text(encoding="utf-8")
-    install(tmp_path / "site", "own_reckoning", module, {"ratslam.backends:reckoning": "own_reckoning:ENTRY"})
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
-    settings = [*SHORT, "live.whisks=6", "backend=reckoning", "backend_settings.scale=0.5"]
-    directory = complete_session(loopback, tmp_path, *settings, longest=280)
-    check_session(directory, 6, [name for name in SAME if not name.startswith("map.") or name == "map.tum"])
-    assert "distance" in (directory / "steps.csv").read_text().splitlines()[0].split(",")
-    assert json.loads((directory / "manifest.json").read_text())["status"] == "complete"

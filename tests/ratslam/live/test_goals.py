@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
-from itertools import pairwise
+from itertools import chain, pairwise, repeat
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import networkx
 import numpy as np
@@ -25,7 +27,7 @@ from ratslam.runs.settings.run_config import load_config
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.arm_route import plan_path
 from robot.live.live_config import GoalConfig, LiveConfig
-from robot.world.maze import Maze, cell_centre, random_maze, wall_boxes
+from robot.world.maze import Maze, cell_centre, change_walls, random_maze, wall_boxes
 from robot.world.scene import MotionConfig
 from robot.world.walls import Surroundings
 from tactile.base.errors import InputError
@@ -38,61 +40,28 @@ from tests.ratslam.runs.test_map_formats import FILES
 
 WAY = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, np.pi / 2]])
 FREE, HOME, BLOCKING = np.zeros((0, 2)), np.zeros(3), NoWay("no other way")
+THERE = np.array([0.5, 0.0, 0.0])
 CONFIG = GoalConfig(map=Path("map.npz"), to=(0, 1), patience=3, replans=2, coast=0.1)
 
 
-class StubPlanner:
-    """Gives the ways of a list, one after the other, and remembers what it was asked."""
-
-    def __init__(self, *ways: np.ndarray | NoWay | None) -> None:
-        self.ways, self.asked = list(ways), []
-
-    def plan(self, pose, goal, obstacles):
-        self.asked.append((pose, goal, obstacles))
-        way = self.ways.pop(0) if len(self.ways) > 1 else self.ways[0]
-        if isinstance(way, NoWay):
-            raise way
-        return way
+NO_CONTACTS = RememberedContacts(np.zeros((0, 3)), [], RECENT)
 
 
-class StubArm:
-    """An arm that remembers what it is told; `refuses` rejects targets."""
-
-    fault = None
-
-    def __init__(self, refuses: bool = False) -> None:
-        self.told: list[object] = []
-        self.refuses = refuses
-
-    def move(self, tcp, speed=None):
-        if self.refuses:
-            raise TargetRefused("outside the box")
-        self.told.append(tcp)
-
-    def halt(self):
-        self.told.append("halt")
-
-
-class Known:
+def known(x: float) -> SimpleNamespace:
     """A map with which contacts agree near one pose."""
-
-    def __init__(self, x: float) -> None:
-        self.x = x
-
-    def align(self, pose, points):
-        return pose
-
-    def agrees(self, pose, points):
-        return abs(pose[0] - self.x) < 0.05
+    return SimpleNamespace(
+        align=lambda pose, points: pose, agrees=lambda pose, points: abs(pose[0] - x) < 0.05
+    )
 
 
-def drive_on(*ways: np.ndarray | NoWay | None) -> tuple[GoalDrive, StubPlanner]:
-    planner = StubPlanner(*(ways or (WAY,)))
-    return GoalDrive(CONFIG, planner, 0.05), planner
+def drive_on(*ways: np.ndarray | NoWay | None) -> tuple[GoalDrive, Mock]:
+    """A drive, and its planner, which gives these ways one after the other."""
+    planner, given = Mock(), ways or (WAY,)
+    planner.plan.side_effect = chain(given, repeat(given[-1]))
+    return GoalDrive(CONFIG, planner, 0.05), planner.plan
 
 
-def route_on(*ways: np.ndarray | NoWay | None, contacts=None) -> GoalRoute:
-    contacts = RememberedContacts(np.zeros((0, 3)), [], RECENT) if contacts is None else contacts
+def route_on(*ways: np.ndarray | NoWay | None, contacts=NO_CONTACTS) -> GoalRoute:
     return GoalRoute(drive_on(*ways)[0], LiveConfig(), contacts)
 
 
@@ -100,15 +69,16 @@ def at(x, y, heading=0.0, points=FREE) -> tuple[np.ndarray, np.ndarray]:
     return np.array([x, y, heading]), np.asarray(points, float)
 
 
-def test_a_corner_has_two_legs_that_pass_all_poses():
+def test_a_corner_has_two_legs_that_pass_all_poses_and_one_place_is_a_leg_without_length():
     scatter = 0.4 * SCATTER * np.random.default_rng(1).uniform(-1, 1, (20, 2))
     straight, none = np.linspace(0, 0.5, 10), np.zeros(10)
     place = np.vstack([np.column_stack([straight, none]), np.column_stack([none + 0.5, straight])])
     way = np.column_stack([place + scatter, np.repeat([0.0, np.pi / 2], 10)])
     legs = legs_of(way)
     assert [leg.heading for leg in legs] == pytest.approx([0.0, np.pi / 2], abs=0.1)
-    line = np.array([legs[0].start, *(leg.end for leg in legs)])
-    assert line_distances(way[:, :2], line).max() <= SCATTER
+    assert line_distances(way[:, :2], np.array([legs[0].start, *(leg.end for leg in legs)])).max() <= SCATTER
+    (leg,) = legs_of(np.array([[1.0, 2.0, 0.5]]))
+    assert [*leg.start, *leg.end, leg.heading] == [1.0, 2.0, 1.0, 2.0, 0.5]
 
 
 def test_a_way_driven_backwards_or_sideways_keeps_its_heading():
@@ -116,12 +86,6 @@ def test_a_way_driven_backwards_or_sideways_keeps_its_heading():
     for heading, expected in ((np.pi - 0.1, np.pi), (0.1, 0.0), (1.2, 1.2)):
         found = leg_heading(np.column_stack([place, np.full(5, heading)]))
         assert np.cos(found - expected) == pytest.approx(1.0)
-
-
-def test_one_place_is_a_leg_without_length():
-    (leg,) = legs_of(np.array([[1.0, 2.0, 0.5]]))
-    assert np.array_equal(leg.start, leg.end)
-    assert leg.heading == 0.5
 
 
 def test_legs_are_driven_one_after_the_other_with_turns_on_the_spot():
@@ -141,7 +105,7 @@ def test_legs_are_driven_one_after_the_other_with_turns_on_the_spot():
 
 def test_a_contact_ahead_stops_at_once_and_blocks_when_confirmed():
     ahead, beside = [[0.15, 0.02]], [[0.15, 0.08]]
-    drive, planner = drive_on(WAY, BLOCKING)
+    drive, plan = drive_on(WAY, BLOCKING)
     assert drive.observe(*at(0.0, 0.0, points=beside)) is DriveState.DRIVING
     assert drive.observe(*at(0.02, 0.0, points=ahead)) is DriveState.WAITING
     assert drive.target is None
@@ -149,12 +113,10 @@ def test_a_contact_ahead_stops_at_once_and_blocks_when_confirmed():
     drive.observe(*at(0.02, 0.0, points=ahead))
     assert drive.observe(*at(0.02, 0.0, points=ahead)) is DriveState.BLOCKED
     assert drive.finished
-    assert np.allclose(planner.asked[-1][2], ahead)
+    assert np.allclose(plan.call_args.args[2], ahead)
     assert drive.observe(*at(0.02, 0.0)) is DriveState.BLOCKED, "an end is final"
 
-
-def test_a_new_way_is_driven_and_their_number_is_limited():
-    drive, _ = drive_on()
+    drive, _ = drive_on()  # new ways are driven, and their number is limited
     states = [drive.observe(*at(0.02, 0.0, points=[[0.15, 0.0]])) for _ in range(6)]
     assert states == [DriveState.WAITING, DriveState.DRIVING] * 2 + [DriveState.WAITING, DriveState.BLOCKED]
     assert drive.replans == CONFIG.replans
@@ -169,17 +131,15 @@ def test_without_estimates_the_robot_rests_and_is_lost_in_the_end():
     assert drive.observe(None, FREE) is DriveState.LOST
     drive, _ = drive_on(None)
     ends = [drive.observe(*at(5.0, 5.0)) for _ in range(CONFIG.patience + 1)]
-    assert ends[-1] is DriveState.LOST
-    assert DriveState.LOST not in ends[:-1]
+    assert ends == [DriveState.WAITING] * CONFIG.patience + [DriveState.LOST]
 
 
 def test_a_robot_that_is_elsewhere_gets_a_new_way():
-    drive, planner = drive_on()
+    drive, plan = drive_on()
     drive.observe(*at(0.0, 0.0))
-    drive.observe(*at(0.1, drive.off_way - 0.01))
-    assert len(planner.asked) == 1
-    drive.observe(*at(0.1, drive.off_way + 0.01))
-    assert len(planner.asked) == 2
+    for off, asked in ((-0.01, 1), (0.01, 2)):
+        drive.observe(*at(0.1, drive.off_way + off))
+        assert plan.call_count == asked
 
 
 def test_a_goal_is_reached_only_by_a_sure_pose():
@@ -188,69 +148,36 @@ def test_a_goal_is_reached_only_by_a_sure_pose():
     drive.observe(here, FREE, sure=False)
     ends = []
     while not drive.finished and len(ends) < 200:
-        pose = drive.target if drive.target is not None else here
-        ends.append(drive.observe(pose, FREE, sure=False))
+        ends.append(drive.observe((drive.target if drive.target is not None else here), FREE, sure=False))
     assert drive.state is DriveState.LOST
-    assert DriveState.REACHED not in ends
-    assert DriveState.DRIVING in ends, "some of the way is driven again before"
+    assert set(ends) == {DriveState.WAITING, DriveState.DRIVING, DriveState.LOST}  # some is driven again
 
 
 def test_the_arm_is_moved_and_halted_as_the_drive_decides():
-    route, arm = route_on(), StubArm()
+    route, arm = route_on(), Mock(fault=None)
     assert not route.advance(arm)
-    assert not arm.told, "nothing moves before the first estimate"
+    assert not arm.method_calls, "nothing moves before the first estimate"
     route.see(HOME, FREE, HOME, HOME)
     assert not route.advance(arm)
     assert not route.advance(arm)
-    assert len(arm.told) == 1, "an unchanged target is sent once"
+    assert arm.move.call_count == 1, "an unchanged target is sent once"
     route.rest()
     route.advance(arm)
     route.advance(arm)
-    assert arm.told[1:] == ["halt"]
+    assert [call[0] for call in arm.method_calls] == ["move", "halt"]
 
 
-def test_a_lost_method_coasts_by_the_arm_for_a_while():
+def test_a_lost_method_coasts_by_the_arm_and_a_robot_without_a_place_rests_until_it_is_found_or_lost():
     route = route_on()
     route.see(HOME, FREE, HOME, HOME)
     moved, further = np.array([0.08, 0.0, 0.0]), np.array([0.12, 0.0, 0.0])
     assert route.see(None, FREE, moved, moved) is DriveState.DRIVING
     assert np.allclose(route.pose, moved)
     assert route.see(None, FREE, further, further) is DriveState.WAITING
-
-
-def test_single_wild_estimates_are_ignored_but_a_moved_robot_is_believed():
-    route, there = route_on(), np.array([0.5, 0.0, 0.0])
-    for _ in range(10):
-        route.see(HOME, FREE, HOME, HOME)
-    route.see(there, FREE, HOME, HOME)
-    assert np.hypot(*route.pose[:2]) < 0.01
-    for _ in range(MOVED):
-        route.see(there, FREE, HOME, HOME)
-    assert route.pose == pytest.approx(there, abs=0.02)
-
-
-def test_a_refused_target_blocks_the_way_there():
-    drive, planner = drive_on(WAY, BLOCKING)
-    route = GoalRoute(drive, LiveConfig(), Known(0.0))
-    route.see(HOME, FREE, HOME, HOME)
-    route.advance(StubArm(refuses=True))
-    assert drive.state is DriveState.BLOCKED
-    assert np.allclose(planner.asked[-1][2], [[0.2, 0.0]])
-
-
-@pytest.mark.parametrize(("truth", "believed"), [(0.0, False), (0.5, True)])
-def test_contacts_decide_between_the_pose_and_an_estimate_elsewhere(truth, believed):
-    route, there = route_on(contacts=Known(truth)), np.array([0.5, 0.0, 0.0])
-    for estimate in [HOME] * 3 + [there] * (MOVED + 1):
-        route.see(estimate, FREE, HOME, HOME)
-    assert (route.pose[0] > 0.4) == believed
-
-
-def test_a_robot_without_a_place_rests_until_it_is_found_or_lost():
-    route, arm = route_on(), StubArm()
+    route, arm = route_on(), Mock(fault=None)
     assert route.see(None, FREE, HOME, HOME) is DriveState.WAITING
     route.advance(arm)
-    assert len(arm.told) == 0
+    assert not arm.method_calls
     assert route.see(HOME, FREE, HOME, HOME) is DriveState.DRIVING, "found"
     route = route_on()
     for _ in range(CONFIG.patience + 3):
@@ -258,9 +185,33 @@ def test_a_robot_without_a_place_rests_until_it_is_found_or_lost():
     assert route.drive.state is DriveState.LOST
 
 
-def test_contacts_that_do_not_fit_are_not_a_goal():
+def test_single_wild_estimates_are_ignored_but_a_moved_robot_is_believed():
+    route = route_on()
+    for estimate in [HOME] * 10 + [THERE]:
+        route.see(estimate, FREE, HOME, HOME)
+    assert np.hypot(*route.pose[:2]) < 0.01
+    for _ in range(MOVED):
+        route.see(THERE, FREE, HOME, HOME)
+    assert route.pose == pytest.approx(THERE, abs=0.02)
+
+
+def test_a_refused_target_blocks_the_way_there():
+    drive, plan = drive_on(WAY, BLOCKING)
+    route = GoalRoute(drive, LiveConfig(), known(0.0))
+    route.see(HOME, FREE, HOME, HOME)
+    route.advance(Mock(fault=None, **{"move.side_effect": TargetRefused("outside the box")}))
+    assert drive.state is DriveState.BLOCKED
+    assert np.allclose(plan.call_args.args[2], [[0.2, 0.0]])
+
+
+def test_contacts_decide_between_pose_and_estimate_and_that_do_not_fit_are_not_a_goal():
+    for truth, believed in ((0.0, False), (0.5, True)):
+        route = route_on(contacts=known(truth))
+        for estimate in [HOME] * 3 + [THERE] * (MOVED + 1):
+            route.see(estimate, FREE, HOME, HOME)
+        assert (route.pose[0] > 0.4) == believed
     for truth, reached in ((5.0, False), (0.2, True)):
-        route = route_on(WAY[-1:], contacts=Known(truth))
+        route = route_on(WAY[-1:], contacts=known(truth))
         found = [route.see(WAY[-1], FREE, WAY[-1], WAY[-1]) for _ in range(4)]
         assert (DriveState.REACHED in found) == reached
 
@@ -268,24 +219,18 @@ def test_contacts_that_do_not_fit_are_not_a_goal():
 LOOP = [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1)]
 MAP_POSE = np.array([0.3, -0.2, 0.7])
 """Pose of the map's frame in the maze: drives must not depend on it."""
-TOUCH = TouchConfig()
+TOUCH, GOAL = TouchConfig(), 6
 HEAD = ur10_head(TOUCH.head)
-GOAL = 6
 
 
 def maze(*closed: tuple) -> Maze:
     """A loop of cells with some passages closed."""
-    made = random_maze(3, 2, LOOP, 1.0, stream(5, "maze"))
-    for a, b in closed:
-        wall, place = made.between_cells(a, b)
-        wall[place] = True
-    return made
+    return change_walls(random_maze(3, 2, LOOP, 1.0, stream(5, "maze")), closed, [])
 
 
 def driven(loop_open: bool = True) -> networkx.DiGraph:
     """Experiences every 6 cm along the loop, with the heading of the motion, in the map's frame."""
-    places = [cell_centre(cell) for cell in LOOP + LOOP[:1] * loop_open]
-    poses = []
+    places, poses = [cell_centre(cell) for cell in LOOP + LOOP[:1] * loop_open], []
     for a, b in pairwise(places):
         heading = np.arctan2(*(b - a)[::-1])
         poses += [[*(a + share * (b - a)), heading] for share in (0.0, 1 / 3, 2 / 3)]
@@ -294,9 +239,7 @@ def driven(loop_open: bool = True) -> networkx.DiGraph:
     graph = networkx.DiGraph()
     for k, (x, y, heading) in enumerate(between(MAP_POSE, np.array(poses)).tolist()):
         graph.add_node(k, x=x, y=y, heading=heading)
-    graph.add_edges_from(pairwise(range(len(poses))), traversals=1)
-    if loop_open:
-        graph.add_edge(len(poses) - 1, 0, traversals=1)
+    graph.add_edges_from(pairwise([*graph, 0] if loop_open else graph), traversals=1)
     return graph
 
 
@@ -306,7 +249,7 @@ def driven_to_goal(graph: networkx.DiGraph, made: Maze) -> tuple[GoalDrive, np.n
     config = GoalConfig(map=Path("map.npz"), to=(GOAL,))
     live = LiveConfig.model_validate({"plan": {"motion": {"speed": 0.045}}})
     steered = GoalDrive(config, GoalPlanner(graph, config, live.plan.motion), 0.05)
-    route = GoalRoute(steered, live, RememberedContacts(np.zeros((0, 3)), [], RECENT))
+    route = GoalRoute(steered, live, NO_CONTACTS)
     walls = Surroundings(wall_boxes(made, stream(5, "heights")), HEAD)
     arm = VirtualArm(live, walls, np.array([*cell_centre(LOOP[0]), 0.0]))
     frontend, random = Frontend(TOUCH), stream(5, "estimates")
@@ -315,8 +258,7 @@ def driven_to_goal(graph: networkx.DiGraph, made: Maze) -> tuple[GoalDrive, np.n
             break
         sample = arm.whisk()
         seen = frontend.observe(sample.reading)
-        error = random.normal(0, [0.005, 0.005, 0.03])
-        estimate = between(MAP_POSE, compose(sample.truth, error))
+        estimate = between(MAP_POSE, compose(sample.truth, random.normal(0, [0.005, 0.005, 0.03])))
         route.see(estimate, felt_points(seen, TOUCH.image, HEAD), sample.truth, arm.poses[-1])
     way, node = np.array(arm.poses)[:, :2], graph.nodes[GOAL]
     goal = compose(MAP_POSE, np.array([node["x"], node["y"], 0.0]))[:2]
@@ -343,9 +285,8 @@ def test_a_wall_on_the_only_way_ends_the_drive_before_it():
 @pytest.mark.parametrize(("goal", "found"), [(99, "experience 99"), ((5.0, 5.0), "m from experience")])
 def test_goals_off_the_map_are_refused(goal, found):
     config = GoalConfig(map=Path("map.npz"), to=(goal,))
-    with pytest.raises(InputError, match=r"live\.plan\.goal\.to\[0\]") as error:
+    with pytest.raises(InputError, match=rf"live\.plan\.goal\.to\[0\].*{found}"):
         GoalPlanner(driven(), config, MotionConfig())
-    assert found in str(error.value)
 
 
 def test_the_arm_begins_where_the_session_of_the_map_ended(tmp_path: Path) -> None:
@@ -360,8 +301,7 @@ def test_the_arm_begins_where_the_session_of_the_map_ended(tmp_path: Path) -> No
     assert path_of(*goals) == path_of()[-1:]
     write_tum(tmp_path / "truth.tum", np.arange(2.0), np.array([[0.5, 0.1, 0.0], [0.4, 0.2, 1.0]]))
     assert path_of(*goals) == [pytest.approx([0.4, 0.2, 1.0])]
-    given = path_of(*goals, "live.plan.goal.at=[0.3, 0.1, 90]")
-    assert given == [[0.3, 0.1, pytest.approx(np.pi / 2)]]
+    assert path_of(*goals, "live.plan.goal.at=[0.3, 0.1, 90]") == [[0.3, 0.1, pytest.approx(np.pi / 2)]]
 
 
 @pytest.mark.soak

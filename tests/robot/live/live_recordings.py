@@ -31,8 +31,7 @@ def some_frames(count: int, seed: int = 0, first: int = 0) -> Frames:
 
 
 def some_states(count: int, seed: int = 0) -> np.ndarray:
-    random = np.random.default_rng(seed)
-    states = np.zeros(count, ARM_STATE)
+    random, states = np.random.default_rng(seed), np.zeros(count, ARM_STATE)
     for name in ARM_STATE.names or ():
         shape = states[name].shape
         if ARM_STATE[name].base.kind == "f":
@@ -86,8 +85,7 @@ def content(path: Path, kind: type) -> list[Any]:
 def session(path: Path, whisks: int = 3) -> tuple[list[Cycle], Frames]:
     """Records whisks, arm states and two events; returns the whisk cycles and all frames."""
     frames, states = some_frames(whisks * RATE, seed=whisks), some_states(whisks * 125)
-    recorder = open_recorder(path)
-    cycles = []
+    recorder, cycles = open_recorder(path), []
     recorder.add_event(START, "start", "emulated: a robot, über")
     for k in range(whisks):
         for block in np.split(np.arange(k * RATE, (k + 1) * RATE), RATE // 4):

@@ -1,24 +1,35 @@
-"""Mazes: random loops, walls as boxes, the file format, and routes."""
+"""Mazes: random loops, walls as boxes, the file format, routes, and the head's paths along them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import networkx
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from robot.world import maze as mazes
 from robot.world.maze import CELL_SIDE, Cell, Maze, circuit_route, closed_maze, random_loop, read_maze
+from robot.world.scene import HeadPath, JitterConfig, MotionConfig, add_kidnaps, plan_path, poses_at
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
+from tactile.base.se2 import wrap
 
 SEEDS = st.integers(0, 10**6)
-SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
+
+
+def cells(text: str) -> list[Cell]:
+    """Cells written as column and row."""
+    return [(int(column), int(row)) for column, row in text.split()]
+
+
+SQUARE = cells("00 10 11 01")
+GOOD = "\n\no---o---o\n|   |   |\no   o---o\n|   |   |\no---o---o\n"
 DRAWN = """o---o---o---o---o
 |   |           |
 o   o   o   o   o
@@ -49,11 +60,11 @@ def boxes_of(maze: Maze, seed: int = 0, *heights: tuple[float, ...]) -> mazes.Wa
 @given(SEEDS, st.sampled_from([(7, 5, 20), (5, 5, 20), (12, 8, 40), (2, 2, 4), (3, 2, 6)]))
 def test_a_loop_is_closed_simple_and_anticlockwise(seed: int, size: tuple[int, int, int]) -> None:
     loop = random_loop(*size, stream(seed, "maze.loop"))
-    cells = np.array(loop)
+    place = np.array(loop)
     assert len(set(loop)) == len(loop) == size[2]
-    assert ((cells >= 0) & (cells < size[:2])).all()
-    assert (np.abs(np.roll(cells, -1, axis=0) - cells).sum(axis=1) == 1).all()
-    x, y = cells.T
+    assert ((place >= 0) & (place < size[:2])).all()
+    assert (np.abs(np.roll(place, -1, axis=0) - place).sum(axis=1) == 1).all()
+    x, y = place.T
     assert np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0
     assert mazes.make_anticlockwise(loop) == loop
     assert mazes.make_anticlockwise([loop[0], *loop[:0:-1]]) == loop
@@ -62,10 +73,10 @@ def test_a_loop_is_closed_simple_and_anticlockwise(seed: int, size: tuple[int, i
 @given(SEEDS, st.integers(1, 9), st.integers(1, 9))
 def test_one_way_joins_each_two_cells_of_a_tree(seed: int, columns: int, rows: int) -> None:
     maze = mazes.tree_maze(columns, rows, np.random.default_rng(seed))
-    cells = [(column, row) for column in range(columns) for row in range(rows)]
+    every = [(column, row) for column in range(columns) for row in range(rows)]
     graph = networkx.Graph()
-    graph.add_nodes_from(cells)
-    graph.add_edges_from((cell, other) for cell in cells for other in maze.neighbours(cell))
+    graph.add_nodes_from(every)
+    graph.add_edges_from((cell, other) for cell in every for other in maze.neighbours(cell))
     assert networkx.is_tree(graph)
     assert maze.across[[0, -1]].all()
     assert maze.along[:, [0, -1]].all()
@@ -73,32 +84,16 @@ def test_one_way_joins_each_two_cells_of_a_tree(seed: int, columns: int, rows: i
 
 def test_a_seed_gives_the_same_maze_and_route_for_ever() -> None:
     maze, loop = world(3)
-    assert loop == [(3, 2), (2, 2), (1, 2), (1, 1), (1, 0), (2, 0), (2, 1), (3, 1)]
+    assert loop == cells("32 22 12 11 10 20 21 31")
     assert mazes.maze_text(maze) == DRAWN
     tree = mazes.tree_maze(4, 3, stream(3, "x"))
     assert mazes.maze_text(tree) == TREE
     way = mazes.exploration_route(tree, (0, 0), 12, stream(0, "path"))
-    assert way == [
-        *[(x, 0) for x in range(4)],
-        (3, 1),
-        (3, 2),
-        (2, 2),
-        (1, 2),
-        (1, 1),
-        (0, 1),
-        (0, 2),
-        (0, 1),
-    ]
+    assert way == cells("00 10 20 30 31 32 22 12 11 01 02 01")
     within = mazes.exploration_route(maze, loop[2], 200, stream(1, "path"), loop[2:])
     assert set(within) == set(loop[2:])
     mazes.check_route(maze, within)
-    winding = [(0, 0), (0, 1), (1, 1), (2, 1), (3, 1), (3, 0), (2, 0), (1, 0)]
-    assert mazes.winding_loop(4, 2, stream(3, "loop")) == winding
-
-
-@pytest.mark.parametrize("size", [(7, 5, 21), (7, 5, 2), (3, 3, 10), (7, 5, 36), (5, 1, 4)])
-def test_an_impossible_loop_length_is_refused(size: tuple[int, int, int], refused: Callable) -> None:
-    refused(lambda: random_loop(*size, stream(0, "x")), "simulation.maze.loop", f"{size[2]} cells")
+    assert mazes.winding_loop(4, 2, stream(3, "loop")) == cells("00 01 11 21 31 30 20 10")
 
 
 @given(SEEDS)
@@ -124,9 +119,12 @@ def test_a_maze_file_is_read_back_equal(
         assert all(np.array_equal(a, b) for a, b in zip(read_maze(path), maze, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("change", "where", "found"),
-    [
+def test_a_faulty_maze_file_is_refused(tmp_path: Path, refused: Callable) -> None:
+    path = tmp_path / "maze.txt"
+    path.write_text(GOOD)
+    read_maze(path)
+    for change, where, found in (
+        ((GOOD, "\n\n"), "", "0 lines"),
         (("|   |   |\no", "|   |    \no"), ":4:9", "gap in the east wall"),
         (("|   |   |\no", "    |   |\no"), ":4:1", "gap in the west wall"),
         (("|\no---o---o", "|\no---o   o"), ":7:6", "gap in the south wall"),
@@ -136,22 +134,9 @@ def test_a_maze_file_is_read_back_equal(
         (("|   |   |\no", "|   #   |\no"), ":4:5", "'#'"),
         (("\no   o", ""), "", "4 columns + 1"),
         (("|   |   |\n", ""), "", "4 lines of up to 9"),
-    ],
-)
-def test_a_faulty_maze_file_is_refused(
-    tmp_path: Path, change: tuple[str, str], where: str, found: str, refused: Callable
-) -> None:
-    good = "\n\no---o---o\n|   |   |\no   o---o\n|   |   |\no---o---o\n"
-    path = tmp_path / "maze.txt"
-    path.write_text(good)
-    read_maze(path)
-    path.write_text(good.replace(*change, 1))
-    refused(lambda: read_maze(path), f"maze.txt{where}: ", found)
-
-
-def test_an_empty_maze_file_is_refused(tmp_path: Path, refused: Callable) -> None:
-    (tmp_path / "empty.txt").write_text("\n\n")
-    refused(lambda: read_maze(tmp_path / "empty.txt"), "empty.txt", "0 lines")
+    ):
+        path.write_text(GOOD.replace(*change, 1))
+        refused(lambda: read_maze(path), f"maze.txt{where}: ", found)
 
 
 def test_boxes_are_at_the_walls_of_the_maze() -> None:
@@ -166,15 +151,13 @@ def test_boxes_are_at_the_walls_of_the_maze() -> None:
     assert set(mixed.height[:-20]) == {0.03, 0.04, 0.05}
     assert set(mixed.height[-20:]) == {0.05}
     names = [mazes.describe_box(boxes, k) for k in (0, 3, 4, 6, 7, 12)]
-    assert names == [
-        *("the wall south of cell (0, 0)", "the wall south of cell (1, 1)"),
-        *("the wall west of cell (0, 0)", "the wall west of cell (2, 0)"),
-        *("the post at corner (0, 0)", "the post at corner (2, 1)"),
-    ]
+    kinds = ("wall south of cell", "wall west of cell", "post at corner")
+    places = ("(0, 0)", "(1, 1)", "(0, 0)", "(2, 0)", "(0, 0)", "(2, 1)")
+    assert names == [f"the {kinds[k // 2]} {place}" for k, place in enumerate(places)]
     assert mazes.cell_centre((2, 0)).tolist() == pytest.approx([0.45, 0.09])
 
 
-def test_changed_walls_are_those_named() -> None:
+def test_changed_walls_are_those_named_and_a_change_that_is_none_is_refused(refused: Callable) -> None:
     before, _ = world(3)
     gap = next((c, r) for r in range(3) for c in range(3) if not before.along[r, c + 1])
     wall = next((c, r) for r in range(3) for c in range(3) if before.along[r, c + 1])
@@ -183,26 +166,20 @@ def test_changed_walls_are_those_named() -> None:
     assert np.argwhere(after.along != before.along).tolist() == sorted([[r, c + 1] for c, r in (gap, wall)])
     assert (after.across == before.across).all()
     assert mazes.change_walls(after, [removed], [added]).along.tolist() == before.along.tolist()
-
-
-@pytest.mark.parametrize(
-    ("pair", "key", "found"),
-    [
-        (((0, 0), (1, 1)), "added", "cells"),
-        (((0, 0), (-1, 0)), "removed", "cells"),
-        (((0, 0), (1, 0)), "added", "a wall between"),
-    ],
-)
-def test_a_change_that_is_none_is_refused(pair: tuple[Cell, Cell], key: str, found: str, refused) -> None:
-    changes: dict[str, list[tuple[Cell, Cell]]] = {"added": [], "removed": []}
-    changes[key].append(pair)
-    refused(lambda: mazes.change_walls(closed_maze(2, 2), **changes), f"simulation.maze.{key}[0]: {found}")
+    for added, removed, found in (
+        ([((0, 0), (1, 1))], [], "added[0]: cells"),
+        ([], [((0, 0), (-1, 0))], "removed[0]: cells"),
+        ([((0, 0), (1, 0))], [], "added[0]: a wall between"),
+    ):
+        refused(partial(mazes.change_walls, closed_maze(2, 2), added, removed), f"simulation.maze.{found}")
     with pytest.raises(ValueError, match="not neighbours"):
         closed_maze(2, 2).is_open((0, 0), (1, 1))
 
 
 @given(st.text("CAca", min_size=1, max_size=12), st.integers(0, 1000))
-def test_each_letter_is_one_circuit(word: str, seed: int) -> None:
+def test_each_letter_is_one_circuit_and_explorations_turn_back_in_dead_ends_only(
+    word: str, seed: int
+) -> None:
     maze, loop = world(seed)
     way = circuit_route(loop, word)
     mazes.check_route(maze, way)
@@ -211,11 +188,6 @@ def test_each_letter_is_one_circuit(word: str, seed: int) -> None:
         lap = way[k * len(loop) : (k + 1) * len(loop) + 1]
         assert lap[0] == lap[-1] == loop[0]
         assert lap[:-1] == (loop if letter == "A" else [loop[0], *loop[:0:-1]])
-
-
-@given(st.integers(0, 1000))
-def test_an_exploration_passes_no_wall_and_turns_back_only_in_dead_ends(seed: int) -> None:
-    maze, loop = world(seed)
     way = mazes.exploration_route(maze, loop[0], 200, stream(seed, "path"))
     assert len(way) == 200
     mazes.check_route(maze, way)
@@ -228,16 +200,14 @@ def test_a_winding_loop_visits_every_cell_once(columns: int, rows: int, seed: in
     columns, rows = 2 * columns, 2 * rows
     loop = mazes.winding_loop(columns, rows, stream(seed, "loop"))
     assert sorted(loop) == [(x, y) for x in range(columns) for y in range(rows)]
-    for (x, y), (next_x, next_y) in pairwise([*loop, loop[0]]):
-        assert abs(next_x - x) + abs(next_y - y) == 1
+    assert (np.abs(np.diff([*loop, loop[0]], axis=0)).sum(axis=1) == 1).all()
 
 
-@pytest.mark.parametrize("word", ["", "CAB", "C A"])
-def test_invalid_words_are_refused(word: str, refused: Callable[..., InputError]) -> None:
-    refused(lambda: circuit_route(SQUARE, word), "simulation.path.circuits", repr(word))
-
-
-def test_impossible_routes_are_refused_with_their_step(refused: Callable[..., InputError]) -> None:
+def test_impossible_loops_words_and_routes_are_refused(refused: Callable[..., InputError]) -> None:
+    for size in ((7, 5, 21), (7, 5, 2), (3, 3, 10), (7, 5, 36), (5, 1, 4)):
+        refused(lambda size=size: random_loop(*size, stream(0, "x")), "maze.loop", f"{size[2]} cells")
+    for word in ("", "CAB", "C A"):
+        refused(lambda word=word: circuit_route(SQUARE, word), "simulation.path.circuits", repr(word))
     maze, loop = world(0)
     rows = [[(x, y) for x in range(4)] for y in range(3)]
     blocked = next([a, b] for row in rows for a, b in pairwise(row) if not maze.is_open(a, b))
@@ -254,3 +224,72 @@ def test_impossible_routes_are_refused_with_their_step(refused: Callable[..., In
     refused(lambda: mazes.exploration_route(alone, (1, 1), 5, stream(0, "path")), "(1, 1) is walled in")
     refused(lambda: mazes.make_anticlockwise([*SQUARE, *SQUARE]), "simulation.path.loop", "(0, 0) twice")
     refused(lambda: mazes.make_anticlockwise(SQUARE[:3]), "3 cells")
+
+
+# Paths of the head
+
+STEADY = JitterConfig(position=0, yaw_deg=0, speed=0)
+
+
+def route(seed: int, word: str = "CA") -> list[tuple[int, int]]:
+    return circuit_route(random_loop(5, 4, 12, stream(seed, "maze.loop")), word)
+
+
+def path_of(seed: int, **changes: object) -> HeadPath:
+    return plan_path(MotionConfig(**changes), route(seed), stream(seed, "motion"))
+
+
+@given(SEEDS)
+def test_without_jitter_the_path_joins_cell_centres_and_faces_ahead(seed: int) -> None:
+    path = path_of(seed, jitter=STEADY)
+    passed = path.pose[np.concatenate([[True], np.abs(np.diff(path.pose[:, :2], axis=0)).sum(axis=1) > 1e-9])]
+    assert np.allclose(passed[:, :2], [mazes.cell_centre(cell) for cell in route(seed)], atol=1e-12)
+    step, took = np.diff(path.pose, axis=0), np.diff(path.time)
+    driven = np.hypot(step[:, 0], step[:, 1])
+    straight = driven > 1e-9
+    assert np.allclose(driven[straight] / took[straight], 0.03)
+    assert np.allclose(step[straight, 2], 0)
+    course = np.arctan2(step[straight, 1], step[straight, 0])
+    assert np.allclose(wrap(course - path.pose[1:][straight, 2]), 0, atol=1e-9)
+    assert np.allclose(np.abs(step[~straight, 2]) / took[~straight], 0.4)
+    assert (np.abs(step[:, 2]) <= np.pi + 1e-12).all()
+    assert np.isclose(path.duration, 24 * CELL_SIDE / 0.03 + np.abs(step[:, 2]).sum() / 0.4)
+    # Backwards it faces against the direction of travel.
+    there, back = (
+        plan_path(MotionConfig(jitter=STEADY, backwards=way < 0), route(seed, "A")[::way], stream(seed, "m"))
+        for way in (1, -1)
+    )
+    assert np.isclose(there.duration, back.duration)
+    time = np.linspace(0, there.duration, 200)
+    one, other = poses_at(there, time), poses_at(back, there.duration - time)
+    assert np.allclose(one[:, :2], other[:, :2], atol=1e-9)
+    assert np.allclose(wrap(one[:, 2] - other[:, 2]), 0, atol=1e-9)
+    assert (poses_at(there, np.array([-5.0, 1e9])) == there.pose[[0, -1]]).all()
+
+
+def test_the_path_of_a_seed_stays_the_same_with_the_configured_jitter() -> None:
+    path = path_of(3, jitter=JitterConfig(position=0.005, yaw_deg=3.0, speed=0.1))
+    assert (np.diff(path.time) > 0).all()
+    np.testing.assert_allclose(path.time[[1, 2, -1]], [6.165587, 10.092578, 191.124197], atol=1e-6)
+    np.testing.assert_allclose(path.pose[0], [0.634887, 0.088557, 1.548726], atol=1e-6)
+    np.testing.assert_allclose(path.pose[-1], [0.630716, 0.094068, 4.738440], atol=1e-6)
+
+
+@settings(max_examples=40)
+@given(SEEDS, st.lists(st.floats(0.05, 0.7), min_size=1, max_size=4), st.floats(1.0, 30.0))
+@example(0, [0.95], 45.0)
+def test_a_kidnap_continues_at_the_later_pose(seed: int, shares: list[float], ahead: float) -> None:
+    path = path_of(seed)
+    when = [share * path.duration for share in shares]
+    there, jumps = add_kidnaps(path, when, ahead)
+    assert (np.diff(there.time) >= 0).all()
+    # Kidnap k, from 0, leads to `when + (k + 1) * ahead` of the path; the path ends at the first one beyond.
+    beyond = np.sort(when) + ahead * np.arange(1, len(when) + 1) >= path.duration
+    count = int(beyond.argmax()) if beyond.any() else len(when)
+    assert np.allclose(jumps, np.sort(when)[:count])
+    ended = np.sort(when)[count] if beyond.any() else path.duration - ahead * count
+    assert there.duration == pytest.approx(min(ended, path.duration - ahead * count))
+    time = np.linspace(0, there.duration, 300)
+    skipped = ahead * (time[:, None] > jumps).sum(axis=1)
+    away = np.abs(time[:, None] - jumps).min(axis=1, initial=np.inf) > 1e-6
+    assert np.allclose(poses_at(there, time)[away], poses_at(path, time + skipped)[away], atol=1e-9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -35,8 +36,7 @@ REAL = ROOT / "tests" / "data" / "real_touch"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recordings of a robot that drives along an arc at 1 m/s, one of each kind."""
-    folder = tmp_path_factory.mktemp("recordings")
-    time = np.arange(STEPS) / 10
+    folder, time = tmp_path_factory.mktemp("recordings"), np.arange(STEPS) / 10
     heading = 0.05 * np.arange(STEPS)
     x, y = np.cumsum(0.1 * np.cos(heading)), np.cumsum(0.1 * np.sin(heading))
     ranges = 1 + np.abs(np.sin(time[:, None] + np.arange(36)))
@@ -93,59 +93,50 @@ def test_the_configuration_reads_the_recording(folder, written, name, samples, w
         assert config.recall.sector_fov == pytest.approx(2 * np.pi, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("name", "plugin"),
-    [
+def test_a_recording_of_a_registered_source_is_named(written) -> None:
+    for name, plugin in (
         ("stanford/stage_cylinder_2.csv", "whisker_stage"),  # a table without times
         ("purdue/cherry.csv", "whisker_objects"),  # no header
         ("sheffield/TXZY_dataI.mat", "taxel_contacts"),  # no reader of ours
-    ],
-)
-def test_a_recording_of_a_registered_source_is_named(name: str, plugin: str, written) -> None:
-    config, _ = written(REAL / name)
-    assert config.source.plugin == plugin
-    with open_source(config) as source:
-        assert len(list(islice(source, 5))) == 5
+    ):
+        config, _ = written(REAL / name)
+        assert config.source.plugin == plugin
+        with open_source(config) as source:
+            assert len(list(islice(source, 5))) == 5
 
 
 def test_a_table_is_put_together_from_the_files_beside_it(folder: Path, written, monkeypatch) -> None:
     """By a configuration that stands in another folder."""
     monkeypatch.chdir(folder)
     config, text = written(Path("lab_odometry.csv"))
-    assert "lab_scans.csv" in text
-    assert "lab_truth.csv" in text
-    assert "truth: for 100% of the samples" in text
+    for words in ("lab_scans.csv", "lab_truth.csv", "truth: for 100% of the samples"):
+        assert words in text
     table = config.recording.table
     assert (table.pose.heading, table.views.time, table.truth.heading) == ("theta", "time", "yaw")
     assert table.views.max_range == 2.5  # 1.25 times the 90 % quantile, rounded
     monkeypatch.chdir(folder.parent)
     with open_source(config) as source:
-        assert [sample.truth is not None and bool(sample.reading.view_seen) for sample in source] == (
-            [True] * STEPS
-        )
+        known = [sample.truth is not None and bool(sample.reading.view_seen) for sample in source]
+    assert known == [True] * STEPS
 
 
 def images(folder: Path, encoding: str, height: int, width: int) -> Path:
     """A bag of small images of another camera beside the odometry."""
-    entries = []
+    entries, data = [], np.full(width * 4 * height, 7, np.uint8)
+    fields = {"height": height, "width": width, "step": width * 4, "encoding": encoding, "data": data}
     for stamp in STAMPS:
         entries.append(odometry(stamp, (stamp - START) / 10**9, 0, 0))
-        fields = {"height": height, "width": width, "step": width * 4, "encoding": encoding}
-        data = {"header": header(stamp), "data": np.full(width * 4 * height, 7, np.uint8)}
-        entries.append(Entry("/camera", "sensor_msgs/msg/Image", stamp, fields | data))
+        entries.append(Entry("/camera", "sensor_msgs/msg/Image", stamp, fields | {"header": header(stamp)}))
     folder.mkdir()
     return write_bag(folder, "mcap", entries)
 
 
-def test_small_images_are_views_as_they_are(tmp_path: Path, written) -> None:
+def test_small_images_are_views_as_they_are_and_other_robots_are_named(tmp_path: Path, written) -> None:
     images(tmp_path / "bag", "mono8", 3, 6)
     config, _ = written(tmp_path / "bag" / "run" / "metadata.yaml")
     assert config.recording.file == tmp_path / "bag" / "run"
     with open_source(config) as source:
         assert source.view_shape == (3, 6, 1)
-
-
-def test_other_robots_are_named(tmp_path: Path, written) -> None:
     still = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
     links = [
         tf(stamp, *(transform(stamp, f"{name}/odom", f"{name}/base_link", stamp / 10**9 - 1.7e9, 0, still)
@@ -156,22 +147,18 @@ def test_other_robots_are_named(tmp_path: Path, written) -> None:
     config, text = written(tmp_path / "run.bag")
     assert config.recording.topics.odometry.tf == ("ada/odom", "ada/base_link")
     assert "other robots: [bob/odom, bob/base_link]" in text
-    assert "frames: ada/odom -> ada/base_link, bob/odom -> bob/base_link; 0 fixed links" in text
 
 
 def test_what_cannot_be_read_is_a_fault(folder: Path, tmp_path: Path, capsys) -> None:
     """A fault that a setting cures has a configuration to set it in."""
-    output = tmp_path / "mine.yaml"
+    output, bag = tmp_path / "mine.yaml", images(tmp_path / "bag", "32FC1", 60, 80)
     for path, words in (
-        (images(tmp_path / "bag", "32FC1", 60, 80),
-         ("/camera, message 0, at", "distances (32FC1)", "recording.topics.views")),
-        (folder / "walls.csv", ("no configuration reads it",)),
-        (folder / "degrees.csv", ("--set recording.table.units.angle=deg",)),
-    ):  # fmt: skip
+        (bag, r"/camera, message 0, at.*distances \(32FC1\).*recording.topics.views"),
+        (folder / "walls.csv", "no configuration reads it"),
+        (folder / "degrees.csv", "--set recording.table.units.angle=deg"),
+    ):
         assert not output.exists()
-        text = said(capsys, "doctor", path, "-o", output, code=1)
-        faults = [line for line in text.splitlines() if line.startswith("fault: ")]
-        assert any(all(word in fault for word in words) for fault in faults)
+        assert re.search(f"fault: .*{words}", said(capsys, "doctor", path, "-o", output, code=1))
     assert output.exists()
 
 
@@ -232,15 +219,11 @@ def run(tmp_path: Path) -> Path:
     return copy_square_run(tmp_path / "run")
 
 
-def change_manifest(run: Path, **changes: Any) -> None:
-    file = run / "manifest.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
-
-
 def test_a_good_map_is_believed_and_the_doubt_in_its_health_decides(run: Path, capsys) -> None:
     text = said(capsys, "doctor", run)
     for words in ("Believe this map.", ": better than odometry", "input: clean", "loop closures: "):
         assert words in text
+    assert "--continue" not in text
     for doubt, words in (
         (0.9, "Do not believe this map. It is 90%"),
         (0.5, "Take this map with care. It is 50%"),
@@ -252,7 +235,7 @@ def test_a_good_map_is_believed_and_the_doubt_in_its_health_decides(run: Path, c
         assert ("keyframes.noise" in text) == (doubt > 0.1)
 
 
-def test_a_map_as_good_as_the_odometry_or_worse_is_told(run: Path, capsys) -> None:
+def test_a_map_as_good_as_the_odometry_or_worse_or_without_closures_is_told(run: Path, capsys) -> None:
     path, odometry = (run / "trajectory.tum").read_text(), (run / "odometry.tum").read_text()
     (run / "trajectory.tum").write_text(odometry)
     assert ": no better than odometry" in said(capsys, "doctor", run)
@@ -260,9 +243,6 @@ def test_a_map_as_good_as_the_odometry_or_worse_is_told(run: Path, capsys) -> No
     assert ": worse than odometry" in said(capsys, "doctor", run)
     (run / "truth.tum").write_text("")
     assert "nothing but the health tells" in said(capsys, "doctor", run)
-
-
-def test_a_map_without_closures_has_a_reason(run: Path, capsys) -> None:
     file = run / "closures.csv"
     file.write_text(file.read_text().replace(",accepted,", ",open,"))
     assert "no loop closure was accepted" in said(capsys, "doctor", run)
@@ -270,42 +250,32 @@ def test_a_map_without_closures_has_a_reason(run: Path, capsys) -> None:
     assert "no place was recognised" in said(capsys, "doctor", run)
 
 
-@pytest.mark.parametrize(
-    ("digest", "steps", "words"),
-    [
-        ("abc", True, "It was killed, or ended by an error"),
-        ("abc", False, "a run that was killed before its first step"),
-        ("", True, "next: map its recording: python -m ratslam run "),
-    ],
-)
-def test_a_killed_run_is_said_to_be_killed_and_how_to_go_on(run: Path, capsys, digest, steps, words) -> None:
-    recording = json.loads((run / "manifest.json").read_text())["recording"]
-    change_manifest(run, status="running", recording=recording | {"sha256": digest})
-    if not steps:
-        (run / "online.tum").write_text("")
-    text = said(capsys, "doctor", run)
-    assert words in text
-    assert (f"--continue {run}/map.npz" in text) == bool(digest)
-    assert "This method" not in text
+def test_a_run_is_said_to_be_interrupted_or_killed_and_how_to_go_on(run: Path, capsys) -> None:
+    manifest = json.loads((run / "manifest.json").read_text())
+    for status, digest, words in (
+        ("interrupted", "abc", ""),
+        ("running", "", "next: map its recording: python -m ratslam run "),
+        ("running", "abc", "It was killed, or ended by an error"),
+        ("running", "abc", "a run that was killed before its first step"),
+    ):
+        changes = {"status": status, "recording": manifest["recording"] | {"sha256": digest}}
+        (run / "manifest.json").write_text(json.dumps(manifest | changes))
+        if "first step" in words:
+            (run / "online.tum").write_text("")
+        text = said(capsys, "doctor", run)
+        assert words in text
+        assert (f"--continue {run}/map.npz" in text) == bool(digest)
+        assert "This method" not in text
 
 
-def test_an_interrupted_run_can_be_continued(run: Path, capsys) -> None:
-    assert "--continue" not in said(capsys, "doctor", run)
-    change_manifest(run, status="interrupted")
-    assert f"--continue {run}/map.npz" in said(capsys, "doctor", run)
-
-
-def test_bad_steps_are_faults(run: Path, capsys) -> None:
+def test_bad_steps_are_faults_and_the_advice_is_a_setting_of_the_program(run: Path, capsys) -> None:
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(text.replace("cell_size: 0.1\n", "cell_size: 0.01\n", 1))
+    (advice,) = (line for line in said(capsys, "doctor", run).splitlines() if "cell_size" in line)
+    assert advice.split("--set ")[1].split(":")[0] == "pose_cells.cell_size=0.1"
     header, *lines = (run / "steps.csv").read_text().splitlines()
     cells = lines[7].split(",")
     cells[header.split(",").index("outcome")] = "too_fast"
     lines[7] = ",".join(cells)
     (run / "steps.csv").write_text("\n".join([header, *lines]) + "\n")
     assert "fault: 1 of 349 steps: too fast" in said(capsys, "doctor", run, code=1)
-
-
-def test_the_advice_is_a_setting_of_the_program(run: Path, capsys) -> None:
-    text = (run / "config.yaml").read_text()
-    (run / "config.yaml").write_text(text.replace("cell_size: 0.1\n", "cell_size: 0.01\n", 1))
-    (advice,) = (line for line in said(capsys, "doctor", run).splitlines() if "cell_size" in line)
-    assert advice.split("--set ")[1].split(":")[0] == "pose_cells.cell_size=0.1"

@@ -53,12 +53,8 @@ class Shown:
         return dict(sorted(self.rows(entity, component), key=lambda row: row[0]))
 
 
-def assert_same_files(one, other):
-    first, second = (
-        {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "timing.csv"}
-        for folder in (one, other)
-    )
-    assert first == second
+def files_of(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "timing.csv"}
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +73,7 @@ def viewed(tmp_path_factory):
 
 def test_a_view_in_a_file_changes_no_result_and_shows_every_step(plain, viewed):
     directory, shown = viewed
-    assert_same_files(plain, directory)
+    assert files_of(plain) == files_of(directory)
     done = read_run(directory)
     steps, last = len(done.time), len(done.time) - 1
     places = shown("/world/robot", "Transform3D:translation")
@@ -87,8 +83,7 @@ def test_a_view_in_a_file_changes_no_result_and_shows_every_step(plain, viewed):
     assert len(shown("/view", "Image:buffer")) == len(shown("/health/lost", "Scalars:scalars")) == steps
     (final,) = shown("/world/path", "LineStrips3D:strips")[last]
     assert np.abs(np.array(final)[:, :2] - done.final[:, :2]).max() < 1e-6
-    timelines = {name for chunk in shown.chunks for name in chunk.timeline_names}
-    assert timelines == {"step", "session_time"}
+    assert {name for chunk in shown.chunks for name in chunk.timeline_names} == {"step", "session_time"}
     heading = shown("/pose_cells/heading", "BarChart:values")
     assert list(heading)[:3] == [15, 31, 47]  # the ends of chunks
     assert len(shown("/pose_cells/activity", "DepthImage:buffer")) == len(heading)
@@ -157,24 +152,20 @@ def test_whiskers_bend_to_their_contacts(drawn):
     strips = np.array(shown("/world/robot/head/whiskers", "LineStrips3D:strips")[0])
     expected = whisker_curves(HEAD, contact & HEAD.alive, point, np.full(WHISKERS, 0.025))
     assert np.abs(strips - expected).max() < 1e-6
-    assert np.abs(strips[2, -1] - [0.04, 0.02, 0.025]).max() < 1e-6
     colours = shown("/world/robot/head/whiskers", "LineStrips3D:colors")[0]
     assert len({colours[2], colours[7], colours[0]}) == 3
     contacts = shown("/world/robot/head/contacts", "Points3D:positions")
     assert (len(contacts[0]), len(contacts[1])) == (1, 0)
 
 
-def test_the_first_row_of_a_grid_is_drawn_lowest(drawn):
+def test_the_first_row_of_a_grid_is_drawn_lowest_and_dropped_steps_leave_gaps_only(drawn):
+    """Steps 2 to 5 were dropped; a closure of one of them is drawn all the same, at the next known pose."""
     grid = GridDrawing(np.array([[0.0, 0.1, 0.2], [0.3, 0.4, 1.0]]), np.array([-1.0, 2.0]), 0.5)
     shown = drawn(([step(0)], MapReport(NO_CLOSURES, None, np.zeros((1, 3)), grid)))
     (data,) = shown("/world/grid", "GridMap:data")[0]
     assert list(data) == [30, 40, 100, 0, 10, 20]  # images begin with the upper row
     ((x, y, _),) = shown("/world/grid", "GridMap:translation")[0]
     assert (x, y) == (-1.0, 2.0)
-
-
-def test_dropped_steps_leave_gaps_only(drawn):
-    """Steps 2 to 5 were dropped; a closure of one of them is drawn all the same, at the next known pose."""
     closures = np.array([[0, 3, 1], [1, 900, 1]])  # the latter is of a step that is not known yet
     shown = drawn(([step(0), step(1)], None), ([step(6)], MapReport(closures, None)))
     assert sorted(shown("/world/robot", "Transform3D:translation")) == [0, 1, 6]
@@ -245,7 +236,7 @@ def test_a_viewer_killed_in_the_middle_changes_no_result(plain, tmp_path, capfd)
         finally:
             if server.poll() is None:
                 kill(None, None)
-    assert_same_files(plain, tmp_path / "run")
+    assert files_of(plain) == files_of(tmp_path / "run")
     assert f"127.0.0.1:{port} is gone" in one_warning(capfd)
 
 
@@ -257,26 +248,24 @@ def test_a_viewer_that_accepts_and_never_reads_changes_no_result(plain, tmp_path
         address = f"127.0.0.1:{listener.getsockname()[1]}"
         with Viewer(prepare_target(address), end=1.0) as viewer:
             run(load_config(SQUARE), tmp_path / "run", observers=[viewer])
-    assert_same_files(plain, tmp_path / "run")
+    assert files_of(plain) == files_of(tmp_path / "run")
     assert f"the view at {address} did not keep up" in one_warning(capfd)
 
 
+ENDS = "ended early; the results are complete"
+
+
 @pytest.mark.parametrize(
-    ("code", "messages", "dropped", "words"),
+    ("code", "end", "messages", "dropped", "words"),
     [
-        ("import time; time.sleep(1000)", 1000, range(701, 1001), "messages were dropped"),
-        ("raise SystemExit(1)", 100, range(101), "ended early"),
-        (
-            "import sys; sys.stdin.buffer.read(); raise SystemExit(1)", 1, range(1),
-            "ended early; the results are complete",
-        ),
+        ("import time; time.sleep(1000)", 0.1, 1000, range(701, 1001), "messages were dropped"),
+        ("raise SystemExit(1)", 10.0, 100, range(101), "ended early"),
+        ("import sys; sys.stdin.buffer.read(); raise SystemExit(1)", 10.0, 1, range(1), ENDS),
     ],
     ids=["takes nothing", "fails at once", "fails at the end"],
-)  # fmt: skip
-def test_a_drawing_process_that_does_not_keep_up_is_said_once(code, messages, dropped, words, capfd):
-    with Viewer(
-        "nowhere", end=0.1 if "sleep" in code else 10.0, command=[sys.executable, "-c", code]
-    ) as viewer:
+)
+def test_a_drawing_process_that_does_not_keep_up_is_said_once(code, end, messages, dropped, words, capfd):
+    with Viewer("nowhere", end=end, command=[sys.executable, "-c", code]) as viewer:
         for _ in range(messages):
             viewer.update((bytes(100_000),), None)
     assert viewer.offered == messages

@@ -1,6 +1,8 @@
-"""Whiskers among walls: geometry of bending, beam theory, and strain sensors."""
+"""Whiskers among walls: geometry of bending, beam theory, strain sensors; templates of simulated drives."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,23 +10,22 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from robot.simulation.create.strain_sensors import (
-    Bending,
-    FixedWhiskers,
-    WhiskersConfig,
-    base_strains,
-    bend_whiskers,
-    fixed_whiskers,
-    shaft_tilt,
-)
+from evaluation.papers.fox2012.template_training import ESTIMATORS, HeldOutDrive, drive_held_out
+from ratslam.cli import main
+from robot.simulation.create import strain_sensors as sensors
+from robot.simulation.create.simulated_session import CreateSimulation, CreateSimulationConfig
+from robot.simulation.create.strain_sensors import Bending, WhiskersConfig, bend_whiskers, shaft_tilt
+from robot.touch_source import observation_of, open_touch_source
 from robot.world.arena import Arena, ArenaConfig, make_arena, wall_segments
 from robot.world.walls import segment_distance, segments_cross
+from tactile.base.errors import InputError
+from tactile.frontend import TouchConfig
+from tactile.wall_estimation.strain_templates import StrainTemplates
+from tests.helpers.commands import refused
 
-SEEDS = st.integers(0, 10**6)
-CONFIG = WhiskersConfig()
-FAN = fixed_whiskers(CONFIG)
+SEEDS, CONFIG, FREE = st.integers(0, 10**6), WhiskersConfig(), np.zeros(4, int)
+FAN = sensors.fixed_whiskers(CONFIG)
 LENGTH = FAN.length
-FREE = np.zeros(4, int)
 
 
 def arena_and_poses(seed: int) -> tuple[Arena, np.ndarray]:
@@ -95,7 +96,7 @@ def test_bending_moves_and_is_mirrored_with_the_walls(seed: int, x: float, y: fl
     assert np.allclose(here.reach, there.reach, atol=1e-7)
     mirrored = each(poses * [1, -1, -1], (segments * [1.0, -1.0]).reshape(-1, 4))
     assert np.allclose(here.turn, -mirrored.turn[:, ::-1], atol=1e-9)  # the fan is symmetric
-    one, other = base_strains(CONFIG, FAN, here), base_strains(CONFIG, FAN, mirrored)
+    one, other = sensors.base_strains(CONFIG, FAN, here), sensors.base_strains(CONFIG, FAN, mirrored)
     assert np.allclose(one[..., 0], -other[:, ::-1, 0], atol=1e-12)
 
 
@@ -126,7 +127,7 @@ def test_a_whisker_stays_on_its_side() -> None:
     assert bend_whiskers(ONE, turned[-1:], wall, np.zeros(1, int)).side[0, 0] == -1
 
 
-def test_contact_with_a_tip_and_a_shaft() -> None:
+def test_contact_with_a_tip_and_a_shaft_and_no_wall_in_reach() -> None:
     wall = np.array([[-1.0, 0.0, 1.0, 0.0]])
     height = np.linspace(0.0999, 0.02, 400)  # of the base above the wall, seen at 45 degrees
     poses = np.column_stack([np.zeros(400), height, np.full(400, -np.pi / 4)])
@@ -142,21 +143,10 @@ def test_contact_with_a_tip_and_a_shaft() -> None:
     assert np.abs(np.diff(reach)).max() < 3e-3  # without jumps
     # A whisker along the wall has the wall's direction.
     assert np.allclose(turn[lies] * shaft_tilt(FAN, reach[lies]), np.pi / 4)
-
-
-def test_a_wall_out_of_reach_bends_no_whisker() -> None:
-    wall = np.array([[0.0, 0.5, 1.0, 0.5]])
-    bend = bend_whiskers(FAN, np.zeros((3, 3)), wall, FREE)
-    for column, value in zip(bend, (0.0, LENGTH, 0.0, 0), strict=True):
-        assert (column == value).all()
-    nothing = bend_whiskers(FAN, np.zeros((3, 3)), np.zeros((0, 4)), FREE)
-    assert all((one == other).all() for one, other in zip(bend, nothing, strict=True))
-
-
-def strain_at(shaft: FixedWhiskers, turn: float, reach: float) -> float:
-    """Horizontal strain of a whisker that is turned by an angle by a contact at a distance from its base."""
-    bent = Bending(*(np.full((1, 1), value) for value in (turn, reach, 0.0, 1)))
-    return float(base_strains(CONFIG, shaft._replace(alive=np.ones(1, bool)), bent)[0, 0, 0])
+    for wall in (np.array([[0.0, 0.5, 1.0, 0.5]]), np.zeros((0, 4))):
+        bend = bend_whiskers(FAN, np.zeros((3, 3)), wall, FREE)
+        for column, value in zip(bend, (0.0, LENGTH, 0.0, 0), strict=True):
+            assert (column == value).all()
 
 
 @given(st.floats(0.02, 0.139), st.floats(0.2, 1.0))
@@ -172,12 +162,75 @@ def test_moments_are_those_of_a_tapered_beam(reach: float, taper: float) -> None
     slope = integral(curvature)
     turn = integral(slope)[-1] / reach
     assert shaft_tilt(shaft, np.array(reach)) == pytest.approx(slope[-1] / turn, rel=1e-4)
-    assert strain_at(shaft, turn, reach) == pytest.approx(0.7e-3 * curvature[0], rel=1e-4)
+    bent = Bending(*(np.full((1, 1), value) for value in (turn, reach, 0.0, 1)))
+    strain = sensors.base_strains(CONFIG, shaft._replace(alive=np.ones(1, bool)), bent)
+    assert strain[0, 0, 0] == pytest.approx(0.7e-3 * curvature[0], rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    "changes", [{"dead": (4,)}, {"tip_diameter": 2e-3}, {"mounts": ()}, {"length": 0.0}, {"droop_deg": 45.0}]
-)
-def test_impossible_whiskers_are_refused(changes: dict[str, object]) -> None:
-    with pytest.raises(ValidationError):
-        WhiskersConfig.model_validate(changes)
+def test_impossible_whiskers_are_refused() -> None:
+    wrong = {"dead": (4,), "tip_diameter": 2e-3, "mounts": (), "length": 0.0, "droop_deg": 45.0}
+    for name, value in wrong.items():
+        with pytest.raises(ValidationError):
+            WhiskersConfig.model_validate({name: value})
+
+
+# Strain templates: training by the command, other walls, use in sessions
+
+DRIVES = CreateSimulationConfig(seed=4)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Templates made from a configuration by the program."""
+    folder = tmp_path_factory.mktemp("templates")
+    (folder / "create.yaml").write_text("create_simulation: {seed: 4}\n")
+    path = folder / "new" / "t.npz"
+    assert main(["reproduce", "templates", str(folder / "create.yaml"), "-o", str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def templates(file: Path) -> StrainTemplates:
+    return StrainTemplates.read(file)
+
+
+def errors(drives: list[HeldOutDrive], way: str, known: bool) -> np.ndarray:
+    """Errors [drives, DURATIONS] of one estimator, at trained angles or between them."""
+    return np.array([error[:, ESTIMATORS.index(way)] for _, there, error in drives if there == known])
+
+
+def test_walls_without_training_are_recognised(templates: StrainTemplates) -> None:
+    assert np.abs(templates.mean).sum() == pytest.approx(117.444679)
+    tried = drive_held_out(DRIVES, templates)
+    assert [known for _, known, _ in tried] == [True, False] * 14 + [True]
+    assert np.allclose([angle for angle, _, _ in tried], np.arange(20, 161, 5))
+    assert errors(tried, "winner", True).mean() < 2
+    # Between two templates the error of the nearer one is at least half a step.
+    between = errors(tried, "winner", False)
+    assert between.min() == pytest.approx(5)
+    assert between.mean() < 6
+    assert np.nanmean(errors(tried, "fused", False)) < 1
+    with pytest.raises(InputError, match="does not fit straight whiskers"):
+        drive_held_out(DRIVES, templates._replace(mean=templates.mean[::-1].copy()))
+
+
+def test_sessions_use_the_file(file: Path) -> None:
+    given, seen = {"walls": "template", "templates": file, "max_template_error": None}, []
+    for reports in (given, given | {"templates": None}):
+        simulation = CreateSimulation(CreateSimulationConfig(reports=40, seed=1))
+        samples = open_touch_source(simulation, TouchConfig.model_validate({"reports": reports}))
+        walls = [observation_of(sample) for sample in samples]
+        seen.append([np.degrees(np.arctan2(*one.wall_point[::-1])) for one in walls if one.wall])
+    assert len(seen[0]) == len(seen[1]) > 0
+    assert np.allclose(seen[0], seen[1], atol=10.01)
+
+
+def test_invalid_sessions_are_refused(tmp_path: Path, capsys) -> None:
+    config = tmp_path / "c.yaml"
+    for text, message in (
+        ("simulation: {}\n", "create_simulation"),
+        ("create_simulation: {behaviour: {contact: 0.0019}, whiskers: {length: 0.01}}\n", "no contact"),
+    ):
+        config.write_text(text)
+        assert message in refused(capsys, "reproduce", "templates", config, "-o", tmp_path / "t.npz")
+    assert list(tmp_path.iterdir()) == [config]

@@ -1,31 +1,29 @@
-"""The raw tiers: mechanics compared with theory, cycles in parts, and agreement between the tiers."""
+"""The raw tiers: mechanics compared with theory, agreement; noise and drift; errors of simulated odometry."""
 
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robot.simulation.head import odometry_errors as reckoning
+from robot.simulation.head import whisk_stream
+from robot.simulation.head.baseline import HALL_BASELINE, Baseline, BaselineConfig, make_baseline
 from robot.simulation.head.beam import StreamConfig, make_beam
 from robot.simulation.head.kinematic import HeadSetup, MechanicsConfig
-from robot.simulation.head.simulated_session import simulate_dynamic
-from robot.simulation.head.whisk_stream import (
-    MechanicsModel,
-    WallSweep,
-    advance_balance,
-    simulate_cycles,
-    simulate_free_cycles,
-    simulate_quasistatic,
-    whiskers_at_rest,
-)
+from robot.simulation.head.odometry_errors import OdometryConfig, OdometryErrors
+from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig, simulate_dynamic
+from robot.simulation.head.whisk_stream import MechanicsModel, WallSweep, simulate_cycles
 from robot.world.maze import random_loop, random_maze, wall_boxes
 from robot.world.scene import HeadPath, MotionConfig, plan_path
 from robot.world.walls import NO_CONTACT, Surroundings, Walls
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
+from tactile.base.se2 import between, integrate, wrap
 from tactile.base.types import Cycle, Whisk
 from tactile.calibration import Calibration, CalibrationConfig, calibrate
 from tactile.contact_threshold import ContactConfig, ShaftConfig, detect_contacts, stiffness
@@ -35,7 +33,8 @@ from tactile.whisking import WhiskDrive, WhiskingConfig, whisk_command
 HEAD = ur10_head(HeadConfig())
 STREAM, MECHANICS = StreamConfig(), MechanicsConfig()
 OPEN, RCP = WhiskingConfig(mode="open"), WhiskingConfig()
-TIERS = pytest.mark.parametrize("tier", [simulate_quasistatic, simulate_dynamic])
+QUASISTATIC = whisk_stream.simulate_quasistatic
+TIERS = pytest.mark.parametrize("tier", [QUASISTATIC, simulate_dynamic])
 LOW = Surroundings(Walls(np.array([[-1.0, -1.0, 1.0, 1.0]]), np.array([0.05])), HEAD)
 """A plate under the head: every whisker touches it with its tip."""
 TOUCH = LOW.contact(np.zeros((1, 3))).angle[0]
@@ -52,7 +51,8 @@ def maze(count: int) -> tuple[Surroundings, HeadPath, np.ndarray]:
 
 
 def calibration(tier: MechanicsModel, setup: HeadSetup) -> Calibration:
-    return calibrate(CalibrationConfig(), simulate_free_cycles(tier, setup, 4, stream(9, "calibration")))
+    record = whisk_stream.simulate_free_cycles(tier, setup, 4, stream(9, "calibration"))
+    return calibrate(CalibrationConfig(), record)
 
 
 def one(tier: MechanicsModel, whisking: WhiskingConfig, path: HeadPath = STILL, **mechanics: float) -> Cycle:
@@ -62,31 +62,23 @@ def one(tier: MechanicsModel, whisking: WhiskingConfig, path: HeadPath = STILL, 
 
 
 def detected_contacts(
-    tier: MechanicsModel,
-    count: int,
-    whisking: WhiskingConfig,
-    rate: float = 2000.0,
-    mechanics: MechanicsConfig = MECHANICS,
+    tier: MechanicsModel, count: int, whisking: WhiskingConfig, rate: float = 2000.0
 ) -> Whisk:
-    setup = HeadSetup(HEAD, StreamConfig(rate=rate), mechanics, whisking)
+    setup = HeadSetup(HEAD, StreamConfig(rate=rate), MECHANICS, whisking)
     known = calibration(tier, setup)
     raw = simulate_cycles(tier, setup, *maze(count), stream(1, "sensor"), known.threshold[:, 1])
     whisks = [detect_contacts(ContactConfig(), known, cycle) for cycle in raw]
     return Whisk(*(np.array(column) for column in zip(*whisks, strict=True)))
 
 
-@pytest.mark.parametrize("taper", [0.1, 0.2, 0.6])
-def test_beam_stiffness_matches_theory_at_its_load_positions(taper: float) -> None:
-    model = make_beam(ShaftConfig(taper=taper))
-    for reach in (1.0, 0.65):
+def test_a_beam_has_the_stiffness_of_theory_and_the_modes_of_a_cantilever() -> None:
+    for taper, reach in itertools.product((0.1, 0.2, 0.6), (1.0, 0.65)):
+        model = make_beam(ShaftConfig(taper=taper))
         shape = model.at(np.array(reach))
         loads = np.linalg.solve(model.stiffness, shape)
         hard = reach**2 / (shape @ loads) / model.unit
         assert hard == pytest.approx(stiffness(ShaftConfig(taper=taper), reach), rel=2e-3)
         assert model.moment @ loads == pytest.approx(reach, rel=2e-3)
-
-
-def test_an_untapered_whisker_has_the_modes_of_a_cantilever() -> None:
     first, second = make_beam(ShaftConfig(taper=1.0)).modes
     # Two shapes are an upper bound of the stiffness (Rayleigh and Ritz).
     assert 1.8751**2 <= first < 1.01 * 1.8751**2
@@ -94,29 +86,31 @@ def test_an_untapered_whisker_has_the_modes_of_a_cantilever() -> None:
 
 
 @TIERS
-def test_free_whiskers_follow_the_command_without_contact(tier: MechanicsModel) -> None:
+def test_free_whiskers_follow_the_command_and_calibration_refuses_a_record_with_contacts(
+    tier: MechanicsModel,
+) -> None:
     found = calibration(tier, HeadSetup(ur10_head(HeadConfig(dead=(3, 7))), STREAM, MECHANICS, OPEN))
     assert np.flatnonzero(~found.alive).tolist() == [3, 7]
     np.testing.assert_allclose(found.free[found.alive], np.radians(65), atol=0.02)
     # Tolerance: the sensor's noise and the inertia of the long whiskers.
     assert ((found.sd > 0.97 * 2e-3) & (found.sd < 1.25 * 2e-3))[found.alive].all()
     np.testing.assert_allclose(found.mean, 0.0, atol=3e-4)
+    raw = simulate_cycles(
+        tier, HeadSetup(HEAD, STREAM, MECHANICS, OPEN), *maze(4), stream(1, "s"), np.full(18, np.inf)
+    )
+    with pytest.raises(InputError, match="contacts of whisker"):
+        calibrate(CalibrationConfig(), list(raw))
 
 
 @TIERS
-@pytest.mark.parametrize("servo", [0.2, 1.0])
-def test_drive_and_whisker_share_the_command_beyond_contact(tier: MechanicsModel, servo: float) -> None:
-    cycle = one(tier, WhiskingConfig(mode="open", rate=0.25), servo=servo, slip=1.0)
-    hard = stiffness(ShaftConfig(), 1.0)
-    bend = servo / (servo + hard) * (np.radians(65) - TOUCH)
-    half = len(cycle.time) // 2
-    np.testing.assert_allclose(cycle.angle[half], TOUCH + bend, atol=0.01)
-    np.testing.assert_allclose(cycle.deflection[half, :, 1], hard * bend, atol=0.01)
-    assert (np.abs(cycle.deflection[..., 0]) < 1e-9).all()
-
-
-@TIERS
-def test_whiskers_bent_too_far_slip_off(tier: MechanicsModel) -> None:
+def test_drive_and_whisker_share_the_command_beyond_contact_until_it_slips_off(tier: MechanicsModel) -> None:
+    for servo in (0.2, 1.0):
+        cycle = one(tier, WhiskingConfig(mode="open", rate=0.25), servo=servo, slip=1.0)
+        hard = stiffness(ShaftConfig(), 1.0)
+        bend, half = servo / (servo + hard) * (np.radians(65) - TOUCH), len(cycle.time) // 2
+        np.testing.assert_allclose(cycle.angle[half], TOUCH + bend, atol=0.01)
+        np.testing.assert_allclose(cycle.deflection[half, :, 1], hard * bend, atol=0.01)
+        assert (np.abs(cycle.deflection[..., 0]) < 1e-9).all()
     cycle = one(tier, OPEN, slip=0.1)
     early, half = TOUCH < 0.9, len(cycle.time) // 2
     assert early.any()
@@ -131,28 +125,27 @@ def test_readings_do_not_depend_on_the_batch_size_and_stay_the_same(tier: Mechan
         for setup in (HeadSetup(HEAD, StreamConfig(batch=n), MECHANICS, RCP) for n in (2, 5))
     ]
     for a, b in zip(*runs, strict=True):
-        assert np.array_equal(a.time, b.time)
-        np.testing.assert_allclose(a.angle, b.angle, atol=1e-9)
-        np.testing.assert_allclose(a.deflection, b.deflection, atol=1e-9)
+        for part in ("time", "angle", "deflection"):
+            np.testing.assert_allclose(getattr(a, part), getattr(b, part), rtol=0, atol=1e-9)
     found = [(abs(c.angle).mean(), *abs(c.deflection).mean(axis=(0, 1))) for c in (runs[1][0], runs[1][4])]
     known = {
-        simulate_quasistatic: [[0.5357699, 0.00304992, 0.009217382], [0.5528546, 0.002619151, 0.005415424]],
+        QUASISTATIC: [[0.5357699, 0.00304992, 0.009217382], [0.5528546, 0.002619151, 0.005415424]],
         simulate_dynamic: [[0.533394, 0.002933946, 0.009578027], [0.5520067, 0.002504011, 0.005603496]],
     }
     np.testing.assert_allclose(found, known[tier], rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "mode", ["open", *(pytest.param(mode, marks=pytest.mark.soak) for mode in ("rcp", "spread"))]
-)
+SOAK_MODES = [pytest.param(mode, marks=pytest.mark.soak) for mode in ("rcp", "spread")]
+
+
+@pytest.mark.parametrize("mode", ["open", *SOAK_MODES])
 def test_both_raw_tiers_agree_on_contacts(mode: str) -> None:
     whisking = WhiskingConfig(mode=mode)
-    slow, quick = (detected_contacts(tier, 30, whisking) for tier in (simulate_dynamic, simulate_quasistatic))
+    slow, quick = (detected_contacts(tier, 30, whisking) for tier in (simulate_dynamic, QUASISTATIC))
     assert slow.contact.mean() > 0.1
     assert (slow.contact != quick.contact).mean() < 0.02
     assert (slow.held != quick.held).mean() < 0.03
-    both = slow.contact & quick.contact
-    assert np.abs(slow.touched - quick.touched)[both].mean() < 0.015
+    assert np.abs(slow.touched - quick.touched)[slow.contact & quick.contact].mean() < 0.015
 
 
 @TIERS
@@ -161,14 +154,6 @@ def test_contacts_do_not_depend_on_the_sample_rate(tier: MechanicsModel) -> None
     assert (usual.contact != other.contact).sum() <= 1
     off = (usual.touched - other.touched)[usual.contact & other.contact]
     assert np.sqrt((off**2).mean()) < 2e-3 * np.pi * np.radians(65)
-
-
-@TIERS
-def test_calibration_refuses_a_record_with_contacts(tier: MechanicsModel) -> None:
-    setup = HeadSetup(HEAD, STREAM, MECHANICS, OPEN)
-    raw = simulate_cycles(tier, setup, *maze(4), stream(1, "s"), np.full(18, np.inf))
-    with pytest.raises(InputError, match="contacts of whisker"):
-        calibrate(CalibrationConfig(), list(raw))
 
 
 def sweep() -> WallSweep:
@@ -182,9 +167,10 @@ def sweep() -> WallSweep:
     return WallSweep(np.arange(SAMPLES) / SAMPLES, wall, reach, drift, noise)
 
 
-@given(
-    st.lists(st.integers(1, SAMPLES - 1), max_size=6, unique=True), st.sampled_from(["open", "rcp", "spread"])
-)
+CUTS = st.lists(st.integers(1, SAMPLES - 1), max_size=6, unique=True)
+
+
+@given(CUTS, st.sampled_from(["open", "rcp", "spread"]))
 def test_a_quasistatic_cycle_in_any_parts_equals_the_whole_to_the_bit(cuts: list[int], mode: str) -> None:
     config, mechanics, whole = StreamConfig(rate=SAMPLES), MechanicsConfig(slip=0.1), sweep()
     whisking = WhiskingConfig(mode=mode)
@@ -192,17 +178,165 @@ def test_a_quasistatic_cycle_in_any_parts_equals_the_whole_to_the_bit(cuts: list
     def law(drive: WhiskDrive, time: float, reading: np.ndarray) -> tuple[np.ndarray, WhiskDrive]:
         return whisk_command(whisking, drive, time, reading, LIMIT, HEAD.shape)
 
-    start = balance = whiskers_at_rest(CYCLES, 18)
+    start = balance = whisk_stream.whiskers_at_rest(CYCLES, 18)
     parts = []
     for first, last in itertools.pairwise([0, *sorted(cuts), SAMPLES]):
-        columns = [column[first:last] for column in whole[:-1]]
-        piece = WallSweep(*columns, whole.noise[:, first:last])
-        found, balance = advance_balance(config, mechanics, law, piece, balance)
+        piece = WallSweep(*[column[first:last] for column in whole[:-1]], whole.noise[:, first:last])
+        found, balance = whisk_stream.advance_balance(config, mechanics, law, piece, balance)
         parts.append(found)
-    once = simulate_quasistatic(HeadSetup(HEAD, config, mechanics, whisking), whole, LIMIT)
+    once = QUASISTATIC(HeadSetup(HEAD, config, mechanics, whisking), whole, LIMIT)
     assert (once[2] > 0).any()
     assert balance.slipped.any()
-    assert not start.touching.any()  # a state can be continued twice
-    assert not start.slipped.any()
+    assert not (start.touching | start.slipped).any()  # a state can be continued twice
     for k, column in enumerate(once):
         assert np.array_equal(np.concatenate([found[k] for found in parts]), column)
+
+
+# Errors of odometry, and coloured noise, drift and creep of whiskers
+
+KINDS = ("white", "gated", "telescoping")
+
+
+def drive_and_turn(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Repeats 20 s ahead at 30 mm/s and 5 s of turning on the spot at 0.4 rad/s."""
+    turns = np.arange(count) % 25 >= 20
+    motion = np.column_stack([np.where(turns, 0, 0.03), np.zeros(count), np.where(turns, 0.4, 0)])
+    motion[0] = 0
+    pose = integrate(motion)
+    pose[:, 2] = np.cumsum(motion[:, 2])
+    return np.arange(count, dtype=float), pose
+
+
+def measured(scene: tuple[np.ndarray, np.ndarray], seed: int = 0, hidden=None, **config: Any) -> np.ndarray:
+    return reckoning.simulate_odometry(OdometryConfig(**config), *scene, stream(seed, "odometry"), hidden)
+
+
+def errors(kind: str, scene: tuple[np.ndarray, np.ndarray], seed: int = 0, **biases: float) -> np.ndarray:
+    """[N - 1, 3] measured motion minus true motion."""
+    error = measured(scene, seed, noise=kind, **biases)[1:, :3] - between(scene[1][:-1], scene[1][1:])
+    return np.column_stack([error[:, :2], wrap(error[:, 2])])
+
+
+def test_errors_of_each_kind_follow_from_their_seed() -> None:
+    assert np.abs(errors("none", drive_and_turn(100))).max() < 1e-12
+    known = {
+        "white": [[-0.073578, 0.108129], [-0.083586, -0.004056], [-0.011004, -0.447488]],
+        "gated": [[-0.073578, 0.042215], [-0.073578, -0.069970], [-0.015004, -0.179417]],
+        "telescoping": [[0.002793, 0.224927], [0.006571, 0.039339], [0.043138, 0.210314]],
+        "none": [[0.017395, 0.042215], [0.017395, 0.042215], [0.044861, 0.108869]],
+    }
+    for kind, sums in known.items():
+        error = errors(kind, drive_and_turn(60), 3, length_bias=0.02, heading_bias=0.1)
+        np.testing.assert_allclose(np.cumsum(error[:, [0, 2]], axis=0)[[18, 22, 58]], sums, atol=1e-6)
+
+
+def test_noise_does_not_depend_on_the_row_rate_and_a_kidnap_repeats_the_motion_before() -> None:
+    """Errors at twice the row rate add up to the same errors."""
+    time, pose = drive_and_turn(200)
+    fine = np.arange(0, 199.5, 0.5)
+    finely = np.column_stack([np.interp(fine, time, column) for column in pose.T])
+    for kind in KINDS:
+        coarse, halves = errors(kind, (time, pose)), errors(kind, (fine, finely))
+        assert np.allclose(halves[:, [0, 2]].reshape(-1, 2, 2).sum(axis=1), coarse[:, [0, 2]], atol=1e-9)
+    time, pose = drive_and_turn(100)
+    pose[50:] += [0.7, -0.4, 2.0]
+    noisy = measured((time, pose), hidden=np.arange(100) == 50, noise="none")
+    plain = measured((time, pose), noise="none")
+    assert np.allclose(noisy[50, :3], noisy[49, :3])
+    assert np.hypot(*plain[50, :2]) > 0.5
+    assert (np.delete(noisy, 50, 0) == np.delete(plain, 50, 0)).all()
+
+
+RATES = st.sampled_from([0.3, 1.0, 3.7])
+
+
+@given(st.integers(0, 10**6), st.sampled_from([*KINDS, "none"]), RATES, st.floats(0.2, 2.5))
+def test_errors_of_a_growing_path_are_those_of_the_path_so_far(
+    seed: int, kind: str, rate: float, period: float
+) -> None:
+    """To the bit, whatever follows: a live session gives its motions one by one. Row 0 sets the clock."""
+    given = {"noise": kind, "rate": rate, "length_bias": 0.02, "heading_bias": 0.1}
+    _, pose = drive_and_turn(30)
+    time = 0.4 + np.cumsum(period * stream(seed, "times").uniform(0.5, 1.0, len(pose)))
+    growing = OdometryErrors(OdometryConfig(**given), stream(seed, "odometry"))
+    for row in range(len(pose)):
+        whole = measured((time[: row + 1], pose[: row + 1]), seed, **given)
+        assert (whole[0] == 0).all()
+        if row:
+            motion = reckoning.motions_between(pose[row - 1 : row + 1])
+            (step,) = growing.add_to(time[row - 1 : row + 1], motion)
+            assert (*step, time[row] - time[row - 1]) == tuple(whole[-1]), row
+
+
+NOISE = 2e-3
+
+
+@given(st.floats(0.001, 0.5), st.floats(0.05, 3), st.sampled_from([200.0, 2000.0]), st.floats(-1, 1))
+def test_creep_tends_to_its_share_of_a_deflection_and_returns_to_zero(
+    share: float, time: float, rate: float, bend: float
+) -> None:
+    whisker = Baseline(BaselineConfig(creep=share, creep_time=time), NOISE, rate, 1, 0)
+    count = round(rate * time)
+    bent = whisker.wander(np.full((1, count, 1, 2), bend))[0, :, 0, 0]
+    grown = share * bend * (1 - np.exp(-count / (rate * time)))
+    assert bent[-1] == pytest.approx(grown)
+    after = whisker.wander(np.zeros((1, 12 * count, 1, 2)))[0, :, 0, 0]
+    assert after[count - 1] == pytest.approx(grown * np.exp(-count / (rate * time)))
+    assert (np.diff(np.abs(after)) <= 0).all()
+
+
+@given(st.lists(st.integers(1, 119), max_size=6, unique=True))
+def test_the_parts_into_which_the_samples_are_cut_make_no_difference(cuts: list[int]) -> None:
+    deflection = stream(1, "bends").standard_normal((1, 120, 2, 2))
+
+    def samples(ends: list[int]) -> np.ndarray:
+        made = make_baseline(HALL_BASELINE, NOISE, 100.0, 2, 5)
+        assert made is not None
+        parts = [deflection[:, a:b] for a, b in itertools.pairwise([0, *sorted(ends), 120])]
+        return np.concatenate([made.colour(part) + made.wander(part) for part in parts], axis=1)
+
+    assert np.array_equal(samples(cuts), samples([]))
+    assert make_baseline(BaselineConfig(), NOISE, 2000.0, 18, 0) is None
+
+
+def simulate(baseline: BaselineConfig, **changes: Any) -> HeadSimulation:
+    slow = {"path": {"explore": 4.0}, "stream": {"rate": 1000.0}, "whisking": {"mode": "open"}}
+    mechanics = {"mechanics": {"baseline": baseline.model_dump()}}
+    return HeadSimulation(SimulationConfig.model_validate(slow | mechanics | changes))
+
+
+def bends(source: HeadSimulation) -> np.ndarray:
+    return np.array([sample.reading.deflection for sample in source])
+
+
+@pytest.mark.parametrize("fidelity", ["quasistatic", "dynamic"])
+def test_a_baseline_reaches_the_deflections_of_a_session_and_nothing_else(fidelity: str) -> None:
+    source, plain = (simulate(one, fidelity=fidelity) for one in (HALL_BASELINE, BaselineConfig()))
+    for with_it, without in zip(source, plain, strict=True):
+        assert np.array_equal(with_it.reading.angle, without.reading.angle)
+        assert (np.abs(with_it.reading.deflection - without.reading.deflection).max(axis=0) > NOISE).all()
+    assert np.array_equal(source.odometry, plain.odometry)
+    assert np.array_equal(source.truth, plain.truth)
+    assert np.array_equal(bends(source), bends(source))
+    cut = simulate(HALL_BASELINE, fidelity=fidelity, stream={"rate": 1000.0, "batch": 2})
+    assert np.array_equal(bends(cut), bends(source))
+
+
+def test_drift_goes_on_through_the_free_record_and_from_whisk_to_whisk() -> None:
+    source = simulate(BaselineConfig(drift=100.0), calibration={"max_outlier_share": 0.9})
+    drift = bends(source) - bends(simulate(BaselineConfig(), raw=True))
+    assert (drift[1:, 0] - drift[:-1, -1]).std() < 0.1 * (drift[:, -1] - drift[:, 0]).std()
+    # After 4 s of free record the drift has 2 sd of a second.
+    assert drift[0, 0].std() == pytest.approx(2 * 100 * NOISE, rel=0.5)
+
+
+def test_a_seed_gives_the_same_noise_and_drift_for_ever() -> None:
+    made = make_baseline(HALL_BASELINE, NOISE, 100.0, 200, 5)
+    assert made is not None
+    colour = made.colour(NOISE * stream(5, "sensor").standard_normal((1, 400, 200, 2))) / NOISE
+    drift = made.wander(np.zeros((1, 400, 200, 2)))[0, -1] / NOISE
+    assert colour.std() == pytest.approx(1, rel=0.02)
+    correlation = (colour[0, 1:] * colour[0, :-1]).mean()
+    assert correlation == pytest.approx(np.exp(-0.01 / HALL_BASELINE.colour_time), abs=0.02)
+    assert drift.std() == pytest.approx(HALL_BASELINE.drift * np.sqrt(4.0), rel=0.1)
+    np.testing.assert_allclose([colour[0, 9, 3, 1], drift[3, 1]], [0.150775, 0.825184], atol=1e-6)
