@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 
@@ -14,32 +14,14 @@ from ratslam.mapping.map_state import MapState
 from tactile.base.se2 import compose
 from tactile.base.types import Odometry, observation
 
-CELL = 0.5
-LAP = 200
-"""Keyframes of a lap."""
-STEP = 0.4 * CELL
-BIAS = 0.01
-"""Heading bias of the odometry, rad/m."""
-NOTHING = (-1, 0.0)
-"""No candidate: match and log-likelihood ratio."""
+CELL, STEP, LAP, BIAS = 0.5, 0.2, 200, 0.01
+"""The last two: keyframes of a lap, and the heading bias of the odometry, rad/m."""
 
 
-class Seen(NamedTuple):
-    """Evidence of one step, as recall gives it."""
-
-    keyframe: int
-    match: int
-    shift: int
-    posterior: float
-    log_ratio: float
-
-
-class Pose(NamedTuple):
-    """The part of an estimate that the map changes."""
-
-    place: int
-    previous: int
-    action: int
+Seen = namedtuple("Seen", "keyframe match shift posterior log_ratio")
+"""Evidence of one step, as recall gives it."""
+Pose = namedtuple("Pose", "place previous action")
+"""The part of an estimate that the map changes."""
 
 
 def new_graph(cell, guard, appearance=None, ablation=FULL, **settings):
@@ -67,14 +49,18 @@ def new_map(acceptance=AcceptByOdds, find_tie=None, **settings):
     return KeyframeMap(config, CELL, LabelAppearance(), acceptance, find_tie=find_tie)
 
 
+def step(map, motion, seen, label):
+    """One update by odometry [3], after which the view of this id is seen."""
+    view = observation(Odometry(*np.asarray(motion).tolist(), 0.1), None, view_shape=(1, 1, 1), label=label)
+    return map.update(view, Pose(-1, -1, 0), seen)
+
+
 def drive(map, recalled, first=0, last=LAP + 60, bias=BIAS):
     """Drives keyframes first to last - 1. recalled: match and log ratio by keyframe."""
     turn = 2 * np.pi / LAP - bias * STEP
     for k in range(first, last):
-        match, ratio = recalled.get(k, NOTHING)
-        odometry = Odometry(STEP, 0.0, turn, 0.1) if k else Odometry(0.0, 0.0, 0.0, 0.1)
-        seen = Seen(k, match, 0, float(match >= 0), ratio)
-        map.update(observation(odometry, None, view_shape=(1, 1, 1), label=k), Pose(-1, -1, 0), seen)
+        match, ratio = recalled.get(k, (-1, 0.0))
+        step(map, (STEP, 0.0, turn) if k else (0.0, 0.0, 0.0), Seen(k, match, 0, float(match >= 0), ratio), k)
     return map
 
 
@@ -89,8 +75,7 @@ TRUE = sequence(LAP + 2, 2, 12, 4.0)
 
 def with_log(state, log, cut=None):
     """The same map with these closures and, if given, cuts."""
-    state.log = log
-    state.cut = state.cut if cut is None else cut
+    state.log, state.cut = log, state.cut if cut is None else cut
     return state
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 
@@ -11,34 +11,17 @@ from ratslam.mapping.appearance import LabelAppearance
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.map import KeyframeMap
 from tactile.base.se2 import compose, fit_rigid_motion, integrate
-from tactile.base.types import Odometry, observation
-from tests.ratslam.mapping.map_cases import CELL, STEP, Pose, Seen
+from tests.ratslam.mapping.map_cases import CELL, STEP, Seen, step
 
-GUARD = 20
-CHUNK = 16
-"""Steps between two merges, as in a session."""
-NONE = -1
-RATIO = 4.0
-"""Evidence of what recall finds."""
+GUARD, CHUNK, NONE, RATIO = 20, 16, -1, 4.0
+"""Steps between two merges, as in a session, are a chunk; the last is the evidence of what recall finds."""
 RUN, PAUSE = 15, 5
 """Places in a row that recall finds, and that it does not find thereafter."""
 
 
-class Route(NamedTuple):
-    """A drive of N keyframes.
-
-    Attributes:
-        odometry: [N, 3] motion into each keyframe. truth: [N, 3] poses. place: [N] where each keyframe is
-            along a lap. look: [N] number of its view. recalled: [N] the place that recall finds, `NONE` for
-            none. ratio: [N] its log-likelihood ratio.
-    """
-
-    odometry: np.ndarray
-    truth: np.ndarray
-    place: np.ndarray
-    look: np.ndarray
-    recalled: np.ndarray
-    ratio: np.ndarray
+Route = namedtuple("Route", "odometry truth place look recalled ratio")
+"""A drive of N keyframes: [N, 3] motion into each, [N, 3] poses, [N] where each keyframe is along a lap, [N]
+number of its view, [N] the place that recall finds, `NONE` for none, [N] its log-likelihood ratio."""
 
 
 class LookAppearance(LabelAppearance):
@@ -76,10 +59,8 @@ class Drive:
                 self.rows = merged.label
             match = self._recall(int(self.route.recalled[k]))
             self.rows = np.append(self.rows, k)
-            x, y, turn = self.route.odometry[k].tolist()
             seen = Seen(len(self.rows) - 1, match, 0, float(match >= 0), self.route.ratio[k])
-            reading = observation(Odometry(x, y, turn, 0.1), None, view_shape=(1, 1, 1), label=k)
-            self.experiences.append(int(self.map.update(reading, Pose(-1, -1, 0), seen).place))
+            self.experiences.append(int(step(self.map, self.route.odometry[k], seen, k).place))
         return self
 
     def restored(self):
@@ -96,8 +77,7 @@ class Drive:
 
     def merged_apart(self):
         """[T] true distances of keyframes from those that they are or are merged with, m."""
-        onto = self.rows[self.map.state.archive.row.rows]
-        return self._apart(onto)
+        return self._apart(self.rows[self.map.state.archive.row.rows])
 
     def experience_apart(self):
         """[T] true distances of keyframes from the first one of their experience, m."""
@@ -123,13 +103,11 @@ def off(poses, truth):
     return np.hypot(*(compose(fit_rigid_motion(poses, truth), poses) - truth)[:, :2].T)
 
 
-def drifting(motion, seed, noise=0.02, bias=0.01):
-    """Motions [N, 3] as odometry measures them: with noise of turns (rad) and a bias (rad/m)."""
-    stream = np.random.default_rng(seed)
-    measured = motion.copy()
-    measured[:, 2] += stream.normal(0, noise, len(motion)) - bias * np.hypot(*motion[:, :2].T)
-    measured[0] = 0.0
-    return measured
+def drifting(motion, seed):
+    """Motions [N, 3] as odometry measures them: with noise of turns and a bias."""
+    error = np.random.default_rng(seed).normal(0, 0.02, len(motion)) - 0.01 * np.hypot(*motion[:, :2].T)
+    measured = np.column_stack([motion[:, :2], motion[:, 2] + error])
+    return measured * (np.arange(len(motion)) > 0)[:, None]
 
 
 def arcs(*parts):
@@ -145,35 +123,31 @@ def laps(lap, count, seed):
     motion = np.vstack([np.zeros(3), motion[:-1]])
     k = np.arange(len(motion))
     place = k % len(lap)
-    known = (k >= len(lap)) & (place % (RUN + PAUSE) < RUN)
-    return Route(
-        drifting(motion, seed), truth, place, place, np.where(known, place, NONE), np.full(len(k), RATIO)
-    )
+    recalled = np.where((k >= len(lap)) & (place % (RUN + PAUSE) < RUN), place, NONE)
+    return Route(drifting(motion, seed), truth, place, place, recalled, np.full(len(k), RATIO))
 
 
-def circles(count, seed=0, size=80):
+def circles(count, size):
     """Laps of a circle of `size` keyframes."""
-    return laps(arcs((size, 2 * np.pi)), count, seed)
+    return laps(arcs((size, 2 * np.pi)), count, 0)
 
 
-CORRIDOR = 16
-"""Keyframes of a corridor."""
-NORTH, SOUTH = 0, 74
-"""Places where the two corridors begin."""
+CORRIDOR, NORTH, SOUTH = 16, 0, 74
+"""Keyframes of a corridor, and the places where the two begin."""
 
 
-def corridors(count, seed=0, evidence=1.5):
+def corridors(count):
     """Laps through two parallel corridors that look the same, 1.3 m apart, heading east in both.
 
-    In the first lap recall takes the second corridor for the first one, with this evidence at each keyframe,
-    when only odometry speaks against it; later it finds nothing there.
+    In the first lap recall takes the second corridor for the first one, when only odometry speaks against it;
+    later it finds nothing there.
     """
-    ahead, back, half = (CORRIDOR, 0.0), (CORRIDOR, 0.0), np.pi
-    route = laps(arcs(ahead, (16, half), back, (26, half), ahead, (36, half), back, (26, half)), count, seed)
+    turns = [part for steps in (16, 26, 36, 26) for part in ((CORRIDOR, 0.0), (steps, np.pi))]
+    route = laps(arcs(*turns), count, 0)
     place = route.place
     inside = (place >= SOUTH) & (place < SOUTH + CORRIDOR)
     look = np.where(inside, place - SOUTH + NORTH, place)
     false = (np.arange(len(place)) < SOUTH + CORRIDOR - 1) & inside & (place > SOUTH)
     recalled = np.where(inside, NONE, route.recalled)
     recalled[false] = look[false]
-    return route._replace(look=look, recalled=recalled, ratio=np.where(false, evidence, RATIO))
+    return route._replace(look=look, recalled=recalled, ratio=np.where(false, 1.5, RATIO))

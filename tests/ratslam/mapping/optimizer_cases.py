@@ -15,9 +15,8 @@ START = np.array([2.0, -1.0, 3.0])  # not the origin, and near the wrap of angle
 
 
 def chained(motion, sd=(0.02, 0.02, 0.01)):
-    return OdometryChain(
-        motion, np.hypot(motion[:, 0], motion[:, 1]), np.tile(np.square(sd), (len(motion), 1))
-    )
+    variance = np.tile(np.square(sd), (len(motion), 1))
+    return OdometryChain(motion, np.hypot(motion[:, 0], motion[:, 1]), variance)
 
 
 def closed(pairs, turn=(), sequence=(), scale=()):
@@ -28,9 +27,8 @@ def closed(pairs, turn=(), sequence=(), scale=()):
 def miscalibrated(motion, length, bias, turn_error):
     """The motions [N, 3] that the corrections turn into these."""
     turn = (motion[:, 2] - bias * length) / (1 + turn_error)
-    missing = (turn - motion[:, 2]) / 2
-    c, s = np.cos(missing), np.sin(missing)
-    return np.stack([c * motion[:, 0] - s * motion[:, 1], s * motion[:, 0] + c * motion[:, 1], turn], axis=1)
+    missing = np.exp(0.5j * (turn - motion[:, 2])) * (motion[:, 0] + 1j * motion[:, 1])
+    return np.stack([missing.real, missing.imag, turn], axis=1)
 
 
 def laps(stream, bias=0.0, count=24, noise=0.0, turn_error=0.0):
@@ -38,7 +36,7 @@ def laps(stream, bias=0.0, count=24, noise=0.0, turn_error=0.0):
     at = 2 * np.pi * np.arange(2 * count) / count
     truth = np.stack([3 * np.cos(at), 2 * np.sin(at), wrap(at + np.pi / 2)], axis=1)
     turn = np.where(np.arange(2 * count) < count, 0.0, stream.uniform(-0.6, 0.6, 2 * count))
-    truth = compose(truth, np.stack([0 * turn, 0 * turn, turn], axis=1))
+    truth = compose(truth, np.outer(turn, [0, 0, 1]))
     truth = compose(compose(START, between(truth[0], np.zeros(3))), truth)
     motion = between(truth[:-1], truth[1:])
     chain = chained(miscalibrated(motion, np.hypot(motion[:, 0], motion[:, 1]), bias, turn_error))
@@ -69,13 +67,10 @@ def parts(fit, chain, closures):
     return odometry / np.sqrt(chain.variance), recall / np.sqrt(closures.variance)
 
 
-def sequence_means(recall, closures):
-    sequences = range(len(closures.scale))
-    return np.array([(recall[closures.sequence == k] ** 2).sum(axis=1).mean() for k in sequences])
-
-
 def robust_weights(fit, chain, closures):
-    return (closures.scale / (closures.scale + sequence_means(parts(fit, chain, closures)[1], closures))) ** 2
+    recall = (parts(fit, chain, closures)[1] ** 2).sum(axis=1)
+    means = np.array([recall[closures.sequence == k].mean() for k in range(len(closures.scale))])
+    return (closures.scale / (closures.scale + means)) ** 2
 
 
 def unknowns(fit, prior):

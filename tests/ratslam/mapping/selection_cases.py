@@ -8,22 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.mapping.closure_selection import STEPS, MapHypotheses, SelectionProblem
-from ratslam.mapping.optimizer import (
-    CalibrationPrior,
-    LoopClosures,
-    MapFit,
-    MapProblem,
-    OdometryChain,
-    solve,
-)
+from ratslam.mapping.optimizer import CalibrationPrior, LoopClosures, MapFit, MapProblem, OdometryChain, solve
 from tactile.base.se2 import between, compose, fit_rigid_motion, integrate, wrap
 
-LAP = 60
-STEP = 0.03
+LAP, STEP, RUN = 60, 0.03, 12
 NOISE = np.array([0.006, 0.006, 0.012])  # of odometry, at each frame
 SPREAD = np.array([0.03, 0.03, 0.08])  # of closures
 PRIOR = CalibrationPrior(0.0, 0.02)
-RUN = 12
 
 
 class World(NamedTuple):
@@ -65,10 +56,8 @@ def lap_poses(place: np.ndarray) -> np.ndarray:
     """[n, 3] the poses at places (in frames) along a lap that is not a circle."""
     at = 2 * np.pi * np.arange(LAP) / LAP
     x, y = 0.35 * np.cos(at) + 0.06 * np.cos(3 * at), 0.25 * np.sin(at)
-    along = np.stack([x, y], axis=1)
-    step = np.roll(along, -1, axis=0) - along
-    heading = np.arctan2(step[:, 1], step[:, 0])
-    return np.column_stack([along, heading])[place % LAP]
+    heading = np.arctan2(np.roll(y, -1) - y, np.roll(x, -1) - x)
+    return np.column_stack([x, y, heading])[place % LAP]
 
 
 def world(
@@ -78,19 +67,16 @@ def world(
     false: float = 0.0,
     false_at: tuple[int, int] = (2 * LAP + 6, LAP // 2),
     least: float = 25.0,
-    most: float = 40.0,
     noise: float = 1.0,
 ) -> World:
     """Laps with noise, and true sequences of closures with the first lap, every 20 frames.
 
     Args:
         jumps: (frame, places) by which the robot is carried ahead before a frame. false: evidence of one
-            sequence more. false_at: its first frame, and by how many places it is wrong. least, most:
-            evidence of the true sequences. noise: factor on the noise of the odometry.
+            sequence more. false_at: its first frame, and by how many places it is wrong. least: evidence of
+            the true sequences. noise: factor on the noise of the odometry.
     """
-    stream = np.random.default_rng(seed)
-    count = laps * LAP
-    place = np.arange(count)
+    stream, place = np.random.default_rng(seed), np.arange(laps * LAP)
     steps = between(lap_poses(place[:-1]), lap_poses(place[1:]))
     for frame, places in jumps:
         place[frame:] += places
@@ -100,13 +86,13 @@ def world(
         true[frame - 1] = steps[frame - 1]  # odometry does not measure the jump
     motion = true + noise * stream.normal(0, NOISE, true.shape)
     motion[:, 2] = wrap(motion[:, 2])
-    variance = np.tile((noise * NOISE) ** 2, (count - 1, 1))
+    variance = np.tile((noise * NOISE) ** 2, (len(motion), 1))
     chain = OdometryChain(motion, np.hypot(motion[:, 0], motion[:, 1]), variance)
 
-    edges = sorted({*range(LAP, count + 1, 20), *(frame for frame, _ in jumps)})
+    edges = sorted({*range(LAP, len(place) + 1, 20), *(frame for frame, _ in jumps)})
     spans = [(first + int(stream.integers(0, 4)), end) for first, end in pairwise(edges)]
     sequences = [np.arange(first, min(first + RUN, end)) for first, end in spans if end - first >= 8]
-    evidence = stream.uniform(least, most, len(sequences))
+    evidence = stream.uniform(least, 40.0, len(sequences))
     ahead = np.zeros(len(sequences), int)
     if false:
         sequences.append(np.arange(false_at[0], false_at[0] + RUN))
@@ -123,17 +109,10 @@ def closures_of(frames: list[np.ndarray], match: list[np.ndarray], evidence: np.
     """The closures of R sequences, each of frames [n] with older ones [n], that cost what their evidence [R]
     allows."""
     members = np.array([len(sequence) for sequence in frames])
-    scale = 2 * (evidence - 6) / members
-    return LoopClosures(
-        i=np.concatenate(match),
-        j=np.concatenate(frames),
-        turn=np.zeros(members.sum()),
-        sequence=np.repeat(np.arange(len(frames)), members),
-        variance=SPREAD**2,
-        scale=scale,
-        score=evidence,
-        cost_limit=np.maximum(6.0, 1.5 * scale),
-    )
+    scale, sequence = 2 * (evidence - 6) / members, np.repeat(np.arange(len(frames)), members)
+    closures = np.concatenate(match), np.concatenate(frames), np.zeros(members.sum()), sequence
+    limit = np.maximum(6.0, 1.5 * scale)
+    return LoopClosures(*closures, variance=SPREAD**2, scale=scale, score=evidence, cost_limit=limit)
 
 
 def off(fit: MapFit, truth: np.ndarray) -> float:

@@ -6,28 +6,12 @@ import numpy as np
 import pytest
 
 from ratslam.core.arrays import GrowableArray
-from ratslam.mapping import map_solution as revisits
+from ratslam.mapping import closure_judge, map_solution
 from ratslam.mapping.acceptance import AcceptByEvidence
 from ratslam.mapping.appearance import Appearance, LabelAppearance, ViewAppearance
-from ratslam.mapping.closure_judge import (
-    AT_ONCE,
-    BEYOND,
-    KINDS,
-    doubt_of_closures,
-    judge_anew,
-    judge_sequences,
-    sequence_evidence,
-    shipped_weights,
-)
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.loop_closures import UNLIKELY, Candidate, ClosureLog, Verdict
-from ratslam.mapping.map_solution import (
-    DOUBTED,
-    claimed_revisits,
-    claims_cost,
-    health_features,
-    worse_than_odometry,
-)
+from ratslam.mapping.map_solution import DOUBTED, claimed_revisits, claims_cost, worse_than_odometry
 from ratslam.mapping.map_state import NO_ROBUST_SCALE, MapState
 from ratslam.mapping.optimizer import solve
 from tactile.base.se2 import between, compose
@@ -35,8 +19,7 @@ from tactile.base.types import Odometry, observation
 from tests.helpers.laps import square
 from tests.ratslam.mapping.map_cases import add, at_fit, new_graph, with_log
 
-CELL, GUARD, LAP, SIZE = 0.05, 20, 48, 12
-LAPS = 5
+CELL, GUARD, LAP, SIZE, LAPS = 0.05, 20, 48, 12, 5
 TRUTH = square("A" * LAPS)
 DRIFT = 0.004  # heading error of the odometry, rad a step
 APPEARANCES = {"ids": LabelAppearance, "views": lambda: ViewAppearance(SIZE, None)}
@@ -44,13 +27,10 @@ APPEARANCES = {"ids": LabelAppearance, "views": lambda: ViewAppearance(SIZE, Non
 
 def drive_laps(appearance: Appearance, places: int = LAP) -> MapState:
     """Keyframes on laps around a square of so many places that look different, by odometry that turns."""
-    graph = new_graph(CELL, GUARD, appearance)
-    looks = np.random.default_rng(0).random((LAP, SIZE))
-    pose = TRUTH[0]
+    graph, looks = new_graph(CELL, GUARD, appearance), np.random.default_rng(0).random((LAP, SIZE))
     for k in range(len(TRUTH)):
-        motion = np.zeros(3) if k == 0 else between(TRUTH[k - 1], TRUTH[k]) + [0, 0, DRIFT]
-        pose = compose(pose, motion)
-        add(graph, motion, pose)
+        motion = between(TRUTH[k - 1], TRUTH[k]) + [0, 0, DRIFT] if k else np.zeros(3)
+        add(graph, motion, None if k else TRUTH[0])
         reading = observation(Odometry(*motion, 0.1), looks[k % places, None, :, None], label=k % places)
         appearance.append(reading, motion[2], float(np.hypot(*motion[:2])))
     return graph
@@ -73,10 +53,10 @@ def solution(graph: MapState, log: ClosureLog) -> MapState:
 
 
 CLEAN = [(LAP * lap + 5, LAP * (lap - 1) + 5, 20) for lap in range(1, LAPS)]
+FIRST, EVERY = np.array([0]), np.arange(len(CLEAN))
 FALSE = [(LAP * 2, 12, 30), (LAP * 3 + 5, 30, 30)]
 TURNED_LAPS = np.stack([TRUTH[(k + 7 * (k // LAP)) % LAP] for k in range(len(TRUTH))])
 """Poses by which every lap begins seven places ahead of the one before."""
-FIRST = np.array([0])
 
 
 class JudgedLabels(LabelAppearance):
@@ -107,113 +87,97 @@ def cuts(graph, *frames):
     return cut
 
 
-def evidence(graph, log, sequences, cut=None, after=BEYOND):
-    fit = solution(graph, log).fit()
-    return sequence_evidence(at_fit(graph, fit, log, cuts(graph) if cut is None else cut), sequences, after)
+def evidence(graph, log, sequences, cut=(), after=closure_judge.BEYOND):
+    """The evidence on sequences where the odometry breaks before keyframes `cut`."""
+    found = at_fit(graph, solution(graph, log).fit(), log, cuts(graph, *cut))
+    return closure_judge.sequence_evidence(found, sequences, after)
 
 
-def test_a_true_sequence_has_higher_log_odds_than_a_false_one_of_the_same_map(graph):
-    log = closed([*CLEAN, FALSE[1]])
-    odds = evidence(graph, log, np.arange(log.sequences)).log_odds(shipped_weights())
+def log_odds(*case):
+    return evidence(*case).log_odds(closure_judge.shipped_weights())
+
+
+def judged_odds(graph, log, sequences=FIRST):
+    return closure_judge.judge_sequences(at_fit(graph, graph.fit(), log, graph.cut), sequences)
+
+
+def test_a_true_sequence_has_higher_log_odds_than_a_false_one_and_none_across_a_break_of_the_odometry(graph):
+    odds = log_odds(graph, closed([*CLEAN, FALSE[1]]), np.arange(len(CLEAN) + 1))
     assert odds[:-1].min() > odds[-1]
-
-
-def test_nothing_is_said_of_a_sequence_across_a_break_of_the_odometry(graph):
-    log, every = closed(CLEAN), np.arange(len(CLEAN))
-    odds = evidence(graph, log, every, cuts(graph, 2 * LAP + 30)).log_odds(shipped_weights())
-    assert list(np.isnan(odds)) == [False, False, True, False]  # before the third and the fourth sequence
-    apart = cuts(graph, *(LAP * np.arange(1, LAPS)))
-    assert np.isnan(evidence(graph, log, every, apart).log_odds(shipped_weights())).all()
+    broken = np.isnan(log_odds(graph, closed(CLEAN), EVERY, [2 * LAP + 30]))
+    assert list(broken) == [False, False, True, False]  # before the third and the fourth sequence
+    assert np.isnan(log_odds(graph, closed(CLEAN), EVERY, LAP * np.arange(1, LAPS))).all()
 
 
 def test_views_count_up_to_a_break_and_no_further_than_the_keyframes_known(graph):
-    log = closed(CLEAN)
-    whole = evidence(graph, log, FIRST).counts.sum(axis=(2, 3))
-    ended = evidence(graph, log, FIRST, after=0).counts.sum(axis=(2, 3))
-    assert np.all(ended < whole)
-    assert np.all(whole <= 20 + 2 * BEYOND)
-    cut = evidence(graph, log, FIRST, cuts(graph, LAP + 30)).counts.sum(axis=(2, 3))
+    cases = [evidence(graph, closed(CLEAN), FIRST, *case) for case in ((), ((), 0), ([LAP + 30],))]
+    whole, ended, cut = (case.counts.sum(axis=(2, 3)) for case in cases)
+    assert np.all((ended < whole) & (whole <= 20 + 2 * closure_judge.BEYOND))
     assert np.all((ended <= cut) & (cut < whole))
 
 
-def test_judging_changes_nothing_and_gives_the_same_bits_again(judged):
+def test_judging_changes_nothing_and_says_nothing_of_views_without_weights_or_carried_robots(
+    judged,
+):
     graph, log = judged
     before = {**graph.arrays(), **log.arrays()}
-    first, again = (
-        judge_sequences(at_fit(graph, graph.fit(), log, graph.cut), np.arange(len(CLEAN))) for _ in range(2)
-    )
+    first, again = (judged_odds(graph, log, EVERY) for _ in range(2))
     assert first.tobytes() == again.tobytes()
     after = {**graph.arrays(), **log.arrays()}
     assert all(np.array_equal(before[name], after[name], equal_nan=True) for name in before)
-
-
-def test_of_views_without_weights_and_of_a_robot_that_may_be_carried_nothing_is_said(judged):
-    graph, log = judged
-    assert np.isfinite(judge_sequences(at_fit(graph, graph.fit(), log, graph.cut), FIRST)).all()
+    assert np.isfinite(first[0])
     graph.config = graph.config.model_copy(update={"may_be_carried": True})
-    assert np.isnan(judge_sequences(at_fit(graph, graph.fit(), log, graph.cut), FIRST)).all()
-    graph = drive_laps(LabelAppearance())
-    assert np.isnan(judge_sequences(at_fit(graph, graph.fit(), closed(CLEAN), graph.cut), FIRST)).all()
+    assert np.isnan(judged_odds(graph, log)).all()
+    assert np.isnan(judged_odds(drive_laps(LabelAppearance()), closed(CLEAN))).all()
 
 
 def test_closures_of_a_false_map_are_doubted_and_those_of_a_true_one_are_not(judged):
     graph, _ = judged
     clean, false = (solution(graph, closed(sequences)) for sequences in (CLEAN, FALSE))
-    assert doubt_of_closures(clean) < 0.1 < DOUBTED < doubt_of_closures(false)
-    assert np.isnan(doubt_of_closures(solution(graph, closed([]))))
+    assert closure_judge.doubt_of_closures(clean) < 0.1 < DOUBTED < closure_judge.doubt_of_closures(false)
+    assert np.isnan(closure_judge.doubt_of_closures(solution(graph, closed([]))))
 
 
-def test_an_unlikely_sequence_counts_less_as_its_odds_fall(judged):
-    _, log = judged
+def test_a_sequence_that_has_lost_keyframes_keeps_its_log_odds_and_counts_less_as_they_fall(judged):
+    graph, log = judged
+    log.set_log_odds(EVERY, np.full(len(CLEAN), -7.0))
+    number = np.arange(graph.count)
+    log.merge(number == log.members(1)[0, 0], number, number < 0)
+    closure_judge.judge_anew(with_log(graph, log), EVERY)
+    assert list(log.log_odds() == -7.0) == [False, True, False, False]
     log.set_log_odds(np.arange(3), np.array([UNLIKELY + np.log(0.25), UNLIKELY / 2, np.nan]))
     assert log.credit() == pytest.approx([0.25, 1.0, 1.0, 1.0])
 
 
-def test_a_sequence_that_has_lost_keyframes_keeps_its_log_odds(judged):
-    graph, log = judged
-    log.set_log_odds(np.arange(len(CLEAN)), np.full(len(CLEAN), -7.0))
-    gone = np.zeros(graph.count, bool)
-    gone[log.members(1)[0, 0]] = True
-    log.merge(gone, np.arange(graph.count), np.zeros(graph.count, bool))
-    judge_anew(with_log(graph, log), np.arange(len(CLEAN)))
-    assert list(log.log_odds() == -7.0) == [False, True, False, False]
-
-
-@pytest.mark.parametrize(
-    ("select_every", "odds", "accepted"), [(50, -1.0, False), (50, 3.0, True), (0, -1.0, True)]
-)
-def test_an_unlikely_sequence_waits_for_a_selection(monkeypatch, judged, select_every, odds, accepted):
+@pytest.mark.parametrize(("every", "odds", "accepted"), [(50, -1.0, False), (50, 3.0, True), (0, -1.0, True)])
+def test_an_unlikely_sequence_waits_for_a_selection(monkeypatch, judged, every, odds, accepted):
     graph, _ = judged
-    graph.config = KeyframeMapConfig(select_every=select_every)
-    judge = "ratslam.mapping.acceptance.judge_sequences"
-    monkeypatch.setattr(judge, lambda *map_and_sequences: np.array([odds]))
+    graph.config = KeyframeMapConfig(select_every=every)
+    monkeypatch.setattr("ratslam.mapping.acceptance.judge_sequences", lambda *_: np.array([odds]))
     log = closed(CLEAN[:1])
     log.judge(0, Verdict.OPEN)
-    frame, match, shift, _ = log.members(0)[-1].tolist()
-    candidate = Candidate(frame, match, shift, 0.9, 3.0)
-    assert AcceptByEvidence().judge(with_log(graph, log), 0, candidate) is accepted
-    assert (odds >= AT_ONCE) == accepted or not select_every
+    assert AcceptByEvidence().judge(with_log(graph, log), 0, log.last()) is accepted
+    assert (odds >= closure_judge.AT_ONCE) == accepted or not every
 
 
 def test_shipped_weights_are_those_of_the_features(judged):
     graph, log = judged
-    weights = shipped_weights()
+    weights = closure_judge.shipped_weights()
     assert weights.shape == evidence(graph, log, FIRST).features().shape[1:]
     assert np.all(weights[:, 1:3] >= 0)  # what odometry foretells is never evidence against it
-    within, around = weights[:, 3 : 3 + KINDS], weights[:, 3 + KINDS :]
-    assert np.all(within[:, :2] <= 0)
-    assert np.all(around[:, :2] <= 0)  # nor are contradictions evidence for it
+    contradictions = np.array([3, 4, 3 + closure_judge.KINDS, 4 + closure_judge.KINDS])
+    assert np.all(weights[:, contradictions] <= 0)  # nor are they evidence for it
 
 
 def test_a_map_with_false_loops_is_doubted_and_one_of_true_closures_is_not(graph):
     clean, false = (solution(graph, closed(rows)) for rows in (CLEAN, FALSE))
     assert worse_than_odometry(clean) < 0.2 < DOUBTED < worse_than_odometry(false)
-    true, wrong = (health_features(found) for found in (clean, false))
+    true, wrong = (map_solution.health_features(found) for found in (clean, false))
     assert true[0] > wrong[0]
     assert true[2] < wrong[2]
     moved = clean.trial()
     moved.pose.rows[:] = compose(np.array([3.0, -2.0, 0.0]), clean.pose.rows)
-    assert health_features(moved) == pytest.approx(true, abs=1e-6)
+    assert map_solution.health_features(moved) == pytest.approx(true, abs=1e-6)
     clean.log.weigh(np.full(len(CLEAN), 0.1))
     assert np.isfinite(worse_than_odometry(clean))  # closures of little weight are closures
     for sequence in range(false.log.sequences):
@@ -239,10 +203,9 @@ def test_right_poses_cost_less_than_wrong_ones_and_those_that_claim_nothing_noth
     assert right < false
     assert claims_cost(graph, solution(graph, closed(CLEAN)).pose.rows) < false
     for poses, cost in ((TRUTH, right), (TURNED_LAPS, wrong)):  # wherever the map lies
-        assert claims_cost(graph, compose(np.array([-1.0, 5.0, -3.0]), poses)) == pytest.approx(
-            cost, rel=1e-9
-        )
+        elsewhere = compose(np.array([-1.0, 5.0, -3.0]), poses)
+        assert claims_cost(graph, elsewhere) == pytest.approx(cost, rel=1e-9)
     apart = TRUTH + np.arange(len(TRUTH))[:, None] * [1.0, 0.0, 0.0]
     assert claims_cost(graph, apart) == claims_cost(graph, TRUTH[: GUARD + 1]) == 0.0
-    monkeypatch.setattr(revisits, "JUDGED", 60)  # however many keyframes are examined
+    monkeypatch.setattr("ratslam.mapping.map_solution.JUDGED", 60)  # however many keyframes are examined
     assert claims_cost(graph, TRUTH) == pytest.approx(right, rel=0.1)

@@ -9,28 +9,12 @@ from hypothesis import strategies as st
 
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
 
-VARIANCE = np.array([0.1, 0.1, 0.02])
-SCALES = (0.5, 2.0, 20.0)
-KEYFRAMES = 60
+VARIANCE, SCALES, KEYFRAMES = np.array([0.1, 0.1, 0.02]), (0.5, 2.0, 20.0), 60
 number, odd = st.integers(0, 10), st.floats(-5, 30)
-steps = st.lists(
-    st.one_of(
-        st.tuples(st.just("add"), st.booleans(), odd),
-        st.tuples(st.just("judge"), number, st.sampled_from(Verdict), st.none() | odd),
-        st.tuples(st.just("rate"), number, odd),
-        st.tuples(st.just("strike"), number, number),
-    ),
-    max_size=30,
-)
-
-
-def filled():
-    """Sequences of 2, 3 and 1 candidates at frames 50, 52, ..; those of sequence k have the gain k + 1."""
-    log = ClosureLog()
-    for k, sequence in enumerate([0, 0, 1, 1, 1, 2]):
-        first = k in (0, 2, 5)
-        assert log.add(Candidate(50 + 2 * k, k, k - 3, 0.9, sequence + 1.0), not first) == sequence
-    return log
+add = st.tuples(st.just("add"), st.booleans(), odd)
+judge = st.tuples(st.just("judge"), number, st.sampled_from(Verdict), st.none() | odd)
+rate, strike = st.tuples(st.just("rate"), number, odd), st.tuples(st.just("strike"), number, number)
+steps = st.lists(add | judge | rate | strike, max_size=30)
 
 
 @given(steps)
@@ -42,9 +26,8 @@ def test_the_log_is_a_list_of_candidates(steps):
         sequence = a % max(len(known), 1)
         if kind == "add":
             follows = bool(a and known)
-            candidate = Candidate(
-                50 + len(rows), len(rows) // 2, len(rows) % 7 - 3, 0.5 + len(rows) / 99, *more
-            )
+            n = len(rows)
+            candidate = Candidate(50 + n, n // 2, n % 7 - 3, 0.5 + n / 99, *more)
             if not follows:
                 known.append([np.inf, Verdict.OPEN, 0.0, np.nan])
             assert log.add(candidate, follows) == len(known) - 1
@@ -70,20 +53,18 @@ def test_the_log_is_a_list_of_candidates(steps):
         counts = [k for k, (_, of) in enumerate(rows) if of >= 0 and known[of][1] == Verdict.ACCEPTED]
         assert log.accepted_rows().tolist() == counts
     assert log.sequences == len(known)
-    scores = []
+    scores = [sum(c.log_ratio for c, of in rows if of == sequence) for sequence in range(len(known))]
     for sequence in range(log.sequences):
         mine = [candidate for candidate, of in rows if of == sequence]
         assert log.members(sequence).tolist() == [[*c[:3], sequence] for c in mine]
-        scores.append(sum(c.log_ratio for c in mine))
-        assert log.score(sequence) == pytest.approx(scores[-1])
+        assert log.score(sequence) == pytest.approx(scores[sequence])
         assert log.sizes()[sequence] == len(mine)
         first, last = log.spans()[sequence].tolist()
         assert (first, last) == (mine[0].keyframe, mine[-1].keyframe) if mine else first > last
     assert log.scores() == pytest.approx(scores, abs=1e-12)
     assert [log.verdict(k) for k in range(len(known))] == log.verdicts().tolist() == [row[1] for row in known]
     nothing = np.inf, Verdict.UNDONE, 0.0, np.nan
-    expected = [[*candidate, of, *(known[of] if of >= 0 else nothing)] for candidate, of in rows]
-    table = log.table()
+    expected, table = [[*one, of, *(known[of] if of >= 0 else nothing)] for one, of in rows], log.table()
     assert np.array_equal(table, np.reshape(expected, (-1, 10)), equal_nan=True)
 
     closures = log.closures(0.2, VARIANCE, SCALES)
@@ -107,25 +88,24 @@ def test_the_log_is_a_list_of_candidates(steps):
     assert (again.sequences, again.last()) == (log.sequences, log.last())
 
 
-@given(steps, st.lists(st.integers(50, 85), max_size=3, unique=True))
+@given(st.lists(add, max_size=30), st.lists(st.integers(50, 85), max_size=3, unique=True))
 def test_no_sequence_lies_across_a_cut(steps, cuts):
     log, cuts = ClosureLog(), np.sort(np.array(cuts, int))
-    for k, (kind, a, *more) in enumerate(steps):
-        if kind == "add":
-            log.add(Candidate(50 + k, k, 0, 0.9, *more), a and log.sequences > 0)
+    for k, (_, follows, ratio) in enumerate(steps):
+        log.add(Candidate(50 + k, k, 0, 0.9, ratio), follows and log.sequences > 0)
     before = [log.members(sequence)[:, 0] for sequence in range(log.sequences)]
     log.reject_across(cuts)
     for sequence, frames in enumerate(before):
-        parts = np.searchsorted(cuts, frames, side="right")
-        largest = np.bincount(parts).max()
         left = log.members(sequence)[:, 0]
-        assert len(left) == largest
+        assert len(left) == np.bincount(np.searchsorted(cuts, frames, side="right")).max()
         assert len(np.unique(np.searchsorted(cuts, left, side="right"))) == 1
         assert np.isin(left, frames).all()
 
 
 def test_weights_belong_to_the_accepted_sequences():
-    log = filled()
+    log = ClosureLog()
+    for k, sequence in enumerate([0, 0, 1, 1, 1, 2]):
+        assert log.add(Candidate(50 + 2 * k, k, k - 3, 0.9, sequence + 1.0), k not in (0, 2, 5)) == sequence
     for sequence in (0, 2):
         log.judge(sequence, Verdict.ACCEPTED)
     assert log.weights().tolist() == [1, 1, 1]
@@ -142,16 +122,12 @@ def random_log(stream, sequences=5):
     log, frame = ClosureLog(), 30
     for _ in range(sequences):
         for k in range(int(stream.integers(1, 7))):
-            evidence = stream.uniform(0.5, 1), stream.normal(3, 2)
-            log.add(
-                Candidate(frame, int(stream.integers(30)), int(stream.integers(2)), *map(float, evidence)),
-                k > 0,
-            )
+            seen = int(stream.integers(30)), int(stream.integers(2))
+            log.add(Candidate(frame, *seen, stream.uniform(0.5, 1), stream.normal(3, 2)), k > 0)
             frame += 1
         log.judge(log.sequences - 1, stream.choice([Verdict.OPEN, Verdict.ACCEPTED]), 1.5)
     log.reject(frame - 3, 0)
-    accepted = int((np.bincount(log.table()[log.accepted_rows(), 5].astype(int)) > 0).sum())
-    log.weigh(stream.uniform(0, 1, accepted))
+    log.weigh(stream.uniform(0, 1, len(np.unique(log.table()[log.accepted_rows(), 5]))))
     return log
 
 
@@ -181,14 +157,13 @@ def test_a_merge_keeps_the_evidence_of_every_sequence(seed):
     before = whole.table()
     left = before[~gone[before[:, 0].astype(int)]]
     frame, match = left[:, :2].astype(int).T
-    expected = left.copy()
-    expected[:, 0], expected[:, 1] = onto[frame], onto[match]
-    expected[:, 2] = np.where(turned[match], 1 - left[:, 2], left[:, 2])
+    shift = np.where(turned[match], 1 - left[:, 2], left[:, 2])
+    expected = np.column_stack([onto[frame], onto[match], shift, left[:, 3:]])
     assert np.array_equal(log.table(), expected, equal_nan=True)
     rows = left[:, 5].astype(int)
     assert log.left().tolist() == np.bincount(rows[rows >= 0], minlength=log.sequences).tolist()
-    merged = [bool((gone[whole.members(k)[:, 0]]).any()) for k in range(log.sequences)]
-    assert [log.has_merged(k) for k in range(log.sequences)] == merged
+    for k in range(log.sequences):
+        assert log.has_merged(k) == gone[whole.members(k)[:, 0]].any()
 
     closures, accepted = log.closures(np.pi, np.ones(3), SCALES), log.table()[log.accepted_rows()]
     sequences = np.unique(accepted[:, 5]).astype(int)
@@ -200,17 +175,17 @@ def test_a_merge_keeps_the_evidence_of_every_sequence(seed):
 
 
 def test_a_sequence_goes_on_after_it_was_merged():
-    log = ClosureLog()
+    log, again = ClosureLog(), ClosureLog()
     for k in range(4):
         log.add(Candidate(30 + k, k, 0, 1.0, 2.0), k > 0)
     gone = np.isin(np.arange(40), [30, 31])
     log.merge(gone, np.where(gone, np.arange(40) - 30, np.cumsum(~gone) - 1), np.zeros(40, bool))
     assert log.last() == Candidate(31, 3, 0, 1.0, 2.0)
     assert log.add(Candidate(32, 4, 0, 1.0, 2.0), True) == 0
-    assert (log.score(0), log.sizes().tolist(), log.left().tolist()) == (10.0, [5], [3])
-    again = ClosureLog()
     again.restore(log.arrays())
-    assert (again.score(0), again.sizes().tolist(), again.has_merged(0)) == (10.0, [5], True)
+    for one in (log, again):
+        found = one.score(0), one.sizes().tolist(), one.left().tolist(), one.has_merged(0)
+        assert found == (10.0, [5], [3], True)
 
 
 def judged(*weights):
@@ -223,13 +198,11 @@ def judged(*weights):
     return log
 
 
-def test_a_sequence_stands_selections_in_a_row():
+def test_a_sequence_stands_selections_in_a_row_and_is_confirmed_by_its_weight():
     log = judged(0.9, 0.5, None)
-    counts = []
-    for _ in range(3):
+    for stood in (1, 2, 3):
         log.count_selection()
-        counts.append(log.confirmations().tolist())
-    assert counts == [[1, 0, 0], [2, 0, 0], [3, 0, 0]]
+        assert log.confirmations().tolist() == [stood, 0, 0]
     log.judge(2, Verdict.ACCEPTED)
     log.weigh(np.array([0.4, 0.6, 1.0]))
     log.count_selection()
@@ -237,16 +210,17 @@ def test_a_sequence_stands_selections_in_a_row():
     log.judge(1, Verdict.OPEN)
     log.count_selection()
     assert log.confirmations().tolist() == [0, 0, 2]
-
-
-def test_sequences_are_confirmed_by_their_weight():
     log = judged(0.9, 0.5, None, 0.8)
     for _ in range(3):
         log.count_selection()
     log.weigh(np.array([0.9, 0.9, 0.4]))
     log.confirm(2)
-    # The second has begun to count, the last no longer does.
-    assert log.confirmations().tolist() == [3, 2, 0, 3]
+    assert log.confirmations().tolist() == [
+        3,
+        2,
+        0,
+        3,
+    ]  # the second has begun to count, the last no longer does
     log.confirm(5)
     assert log.confirmations().tolist() == [5, 5, 0, 3]
 

@@ -18,11 +18,7 @@ from tactile.base.se2 import between, compose, correct_heading, integrate, inver
 from tests.ratslam.mapping.map_cases import add, new_graph, with_log
 from tests.ratslam.mapping.optimizer_cases import apart, miscalibrated
 
-CELL = 0.5
-STEP = 0.19
-GUARD = 20
-LAP = 40
-STOOD, NEWEST = 2, 10
+CELL, STEP, GUARD, LAP, STOOD, NEWEST = 0.5, 0.19, 20, 40, 2, 10
 
 
 class Whiskers(LabelAppearance):
@@ -58,92 +54,69 @@ def log_of(*sequences, stood=STOOD):
     return log
 
 
-def merged(graph, log):
+def line(count):
+    """[count, 3] poses straight ahead."""
+    return STEP * np.outer(np.arange(count), [1.0, 0.0, 0.0])
+
+
+def merged(graph, *sequences, stood=STOOD):
     """The numbers of the merged keyframes."""
-    merge = find_merge(with_log(graph, log), graph.config.merge_newest)
+    merge = find_merge(with_log(graph, log_of(*sequences, stood=stood)), graph.config.merge_newest)
     return [] if merge is None else np.flatnonzero(~merge.is_kept()).tolist()
 
 
-def test_confirmed_keyframes_are_merged_with_those_of_the_first_lap():
+def test_confirmed_keyframes_but_the_newest_are_merged_with_those_of_the_first_lap():
     merge = find_merge(with_log(graph_of(circle(130)), log_of(range(45, 110))), NEWEST)
     gone = np.flatnonzero(~merge.is_kept())
     assert gone.tolist() == list(range(45, 110))
     assert merge.source[merge.onto[gone]].tolist() == [frame % LAP for frame in range(45, 110)]
     assert np.abs(merge.offset).max() < 1e-9
     assert not merge.turned().any()
+    for newest in (10, 40):
+        graph = graph_of(circle(100), merge_newest=newest)
+        assert merged(graph, range(45, 95)) == list(range(45, min(95, 100 - newest)))
 
 
-@pytest.mark.parametrize("newest", [10, 40])
-def test_the_newest_keyframes_are_not_merged(newest):
-    graph = graph_of(circle(100), merge_newest=newest)
-    assert merged(graph, log_of(range(45, 95))) == list(range(45, min(95, 100 - newest)))
-
-
-@pytest.mark.parametrize("stood", [STOOD - 1, STOOD])
-def test_a_sequence_confirms_once_it_has_stood(stood):
+def test_sequences_that_stood_and_weigh_and_both_ends_of_a_seam_confirm():
+    """A sequence that has stood, has weight and is accepted; both ends of a seam that have older ones."""
     graph = graph_of(circle(100))
-    assert bool(merged(graph, log_of(range(45, 76), stood=stood))) == (stood >= STOOD)
-
-
-def test_a_weak_or_refused_sequence_confirms_nothing():
-    graph, log = graph_of(circle(100)), log_of(range(45, 60), range(65, 76))
+    assert merged(graph, range(45, 76), stood=STOOD - 1) == []
+    log = log_of(range(45, 60), range(65, 76))
     log.weigh(np.array([0.5, 0.51]))
-    assert merged(graph, log) == list(range(65, 76))
+    merge = find_merge(with_log(graph, log), NEWEST)
+    assert np.flatnonzero(~merge.is_kept()).tolist() == list(range(65, 76))
     log.judge(1, Verdict.OPEN)
-    assert merged(graph, log) == []
+    assert find_merge(with_log(graph, log), NEWEST) is None
+    assert merged(graph_of(line(100)), range(45, 76)) == merged(graph) == []
+    for seams, confirmed in (([6, GUARD], []), ([60], [59, 60]), ([60, 70], [*range(59, 71)])):
+        graph.seam.rows[:] = np.isin(np.arange(100), seams)
+        assert merged(graph) == confirmed
 
 
 @pytest.mark.parametrize("ahead", [20, 50, 60])
 def test_keyframes_are_merged_within_reach_of_confirmed_ones_before_and_after(ahead):
-    graph = graph_of(circle(140))
     reach = REACH * CELL / STEP
     near = [k for k in range(50, 50 + ahead + 1) if k - 50 <= reach and 50 + ahead - k <= reach]
-    assert merged(graph, log_of([50], [50 + ahead])) == sorted({50, *near, 50 + ahead})
-
-
-def test_keyframes_at_a_cut_and_before_it_are_not_merged():
-    graph = graph_of(circle(100))
-    graph.cut.rows[60] = 0
-    assert merged(graph, log_of(range(45, 76))) == [*range(45, 59), *range(61, 76)]
+    assert merged(graph_of(circle(140)), [50], [50 + ahead]) == sorted({50, *near, 50 + ahead})
 
 
 @pytest.mark.parametrize("error", [[0.5, 0.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, 2 * np.pi]])
-def test_keyframes_near_strained_odometry_are_not_merged(error):
+def test_keyframes_near_strained_odometry_or_a_cut_are_not_merged(error):
     graph = graph_of(circle(100))
     graph.motion.rows[60] += error
     spared = set() if error[2] > np.pi else set(range(54, 66))  # both ends, and 5 more
-    assert merged(graph, log_of(range(45, 76))) == sorted(set(range(45, 76)) - spared)
+    assert merged(graph, range(45, 76)) == sorted(set(range(45, 76)) - spared)
     graph.seam.rows[60] = True  # where no odometry joins them
-    assert merged(graph, log_of(range(45, 76))) == list(range(45, 76))
-
-
-def test_a_turn_near_half_a_turn_is_not_strained():
-    poses = circle(100)
+    assert merged(graph, range(45, 76)) == list(range(45, 76))
+    graph = graph_of(circle(100))
+    graph.cut.rows[60] = 0
+    assert merged(graph, range(45, 76)) == [*range(45, 59), *range(61, 76)]
+    poses = circle(100)  # a turn near half a turn is not strained
     poses[[20, 60], 2] = wrap(poses[[19, 59], 2] + np.pi - 0.001)
     graph = graph_of(poses)
     graph.motion.rows[60, 2] = wrap(graph.motion.rows[60, 2] + 0.002)
     assert abs(graph.motion.rows[60, 2]) > 3.1
-    assert merged(graph, log_of(range(45, 76))) == list(range(45, 76))
-
-
-def test_both_ends_of_a_seam_are_confirmed():
-    graph = graph_of(circle(100))
-    graph.seam.rows[60] = True
-    assert merged(graph, ClosureLog()) == [59, 60]
-    graph.seam.rows[70] = True
-    assert merged(graph, ClosureLog()) == list(range(59, 71))
-
-
-def test_keyframes_without_older_ones_are_not_merged():
-    graph = graph_of(circle(100))
-    graph.seam.rows[[6, GUARD]] = True
-    assert merged(graph, ClosureLog()) == []
-
-
-def test_nothing_is_merged_on_new_ground():
-    straight = np.column_stack([STEP * np.arange(100), np.zeros(100), np.zeros(100)])
-    assert find_merge(with_log(graph_of(straight), log_of(range(45, 76))), NEWEST) is None
-    assert find_merge(with_log(graph_of(circle(100)), ClosureLog()), NEWEST) is None
+    assert merged(graph, range(45, 76)) == list(range(45, 76))
 
 
 @pytest.mark.parametrize(
@@ -151,25 +124,19 @@ def test_nothing_is_merged_on_new_ground():
     [(0.24, 0.0, True), (0.26, 0.0, False), (0.0, 0.24, True), (0.0, 0.28, False), (0.17, -0.25, True)],
 )
 def test_merged_keyframes_are_near_each_other_and_face_alike(aside, turn, met):
-    out = np.column_stack([STEP * np.arange(50), np.zeros(50), np.zeros(50)])
-    far = np.column_stack([np.full(30, 50.0), STEP * np.arange(30), np.zeros(30)])
-    back = np.array([[STEP * 20, aside, turn]])
-    graph = graph_of(np.vstack([out, back, far]))
+    far = np.array([50.0, 0.0, 0.0]) + line(30)[:, [1, 0, 2]]
+    graph = graph_of(np.vstack([line(50), [STEP * 20, aside, turn], far]))
     graph.motion.rows[50:52] = between(graph.pose.rows[49:51], graph.pose.rows[50:52])
-    assert merged(graph, log_of([50])) == ([50] if met else [])
+    assert merged(graph, [50]) == ([50] if met else [])
 
 
-@pytest.mark.parametrize("appearance", [LabelAppearance, Whiskers])
-def test_keyframes_that_face_opposite_ways_are_merged_with_whiskers_only(appearance):
-    there = np.column_stack([STEP * np.arange(50), np.zeros(50), np.full(50, 0.05)])
-    back = np.column_stack([STEP * np.arange(50)[::-1], np.full(50, 0.1), np.full(50, wrap(np.pi - 0.1))])
-    graph = graph_of(np.vstack([there, back]), appearance)
-    merge = find_merge(with_log(graph, log_of(range(65, 85))), NEWEST)
-    if appearance is LabelAppearance:
-        assert merge is None
-    else:
-        assert np.flatnonzero(merge.turned()).tolist() == list(range(65, 85))
-        assert merge.source[merge.onto[65:85]].tolist() == [99 - k for k in range(65, 85)]
+def test_keyframes_that_face_opposite_ways_are_merged_with_whiskers_only():
+    there = line(50) + [0.0, 0.0, 0.05]
+    poses, log = np.vstack([there, line(50)[::-1] + [0.0, 0.1, wrap(np.pi - 0.1)]]), log_of(range(65, 85))
+    assert find_merge(with_log(graph_of(poses), log), NEWEST) is None
+    merge = find_merge(with_log(graph_of(poses, Whiskers), log), NEWEST)
+    assert np.flatnonzero(merge.turned()).tolist() == list(range(65, 85))
+    assert merge.source[merge.onto[65:85]].tolist() == [99 - k for k in range(65, 85)]
 
 
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.integers(60, 160), st.integers(1, 40))
@@ -183,15 +150,12 @@ def test_a_merge_is_one_of_older_kept_keyframes_at_the_same_pose(seed, whiskers,
     merge = find_merge(with_log(graph, log), newest)
     if merge is None:
         return
-    kept = merge.is_kept()
+    kept, onto, offset = merge.is_kept(), merge.source[merge.onto], merge.offset
     gone = np.flatnonzero(~kept)
-    onto, offset = merge.source[merge.onto], merge.offset
     assert np.array_equal(merge.source, np.flatnonzero(kept))
     assert np.array_equal(onto[kept], merge.source)
     assert not offset[kept].any()
-    assert len(gone)
-    assert gone.min() > GUARD
-    assert gone.max() < count - newest
+    assert GUARD < gone.min() <= gone.max() < count - newest
     assert (onto[gone] < gone - GUARD).all()
     assert np.hypot(*offset[gone, :2].T).max() <= NEAR * CELL
     turn = np.abs(offset[gone, 2])
@@ -212,20 +176,14 @@ def test_a_merge_is_one_of_older_kept_keyframes_at_the_same_pose(seed, whiskers,
 seeds = st.integers(0, 2**32 - 1)
 
 
-def empty_graph():
-    return new_graph(CELL, 20)
-
-
 def random_graph(stream, count, bias=0.0, turn_error=0.0, cuts=0):
     """A graph at random poses whose odometry shows these errors and no others."""
-    poses = np.column_stack(
-        [np.cumsum(stream.normal(0, 0.3, (count, 2)), axis=0), stream.normal(0, 2, count)]
-    )
-    poses[:, 2] = wrap(poses[:, 2])
+    position, heading = np.cumsum(stream.normal(0, 0.3, (count, 2)), axis=0), stream.normal(0, 2, count)
+    poses = np.column_stack([position, wrap(heading)])
     true = between(poses[:-1], poses[1:])
     length = np.hypot(*true[:, :2].T) * stream.uniform(1, 1.2, count - 1)
     motion = np.vstack([np.zeros(3), miscalibrated(true, length, bias, turn_error)])
-    graph = empty_graph()
+    graph = new_graph(CELL, GUARD)
     for k, (pose, moved) in enumerate(zip(poses, motion, strict=True)):
         add(graph, moved, pose, length[k - 1] if k else 0.0, abs(moved[2]) + 0.1)
     graph.cut.rows[stream.integers(1, count, cuts)] = 0
@@ -234,15 +192,13 @@ def random_graph(stream, count, bias=0.0, turn_error=0.0, cuts=0):
     return graph
 
 
-def random_merge(stream, graph, share=0.5):
+def random_merge(stream, graph):
     """Merges keyframes other than the first, the newest and those at cuts with older ones that remain."""
-    count, pose = graph.count, graph.pose.rows
-    gone = stream.random(count) < share
-    cut = graph.cut.rows >= 0
-    gone &= ~cut & ~np.append(cut[1:], True)
+    count, pose, cut = graph.count, graph.pose.rows, graph.cut.rows >= 0
+    gone = (stream.random(count) < 0.5) & ~cut & ~np.append(cut[1:], True)
     gone[0] = False
     onto = np.arange(count)
-    for frame in np.flatnonzero(gone).tolist():
+    for frame in np.flatnonzero(gone):
         onto[frame] = stream.choice(np.flatnonzero(~gone[:frame]))
     offset = np.where(gone[:, None], between(pose[onto], pose), 0.0)
     return MergedRows(np.flatnonzero(~gone), (np.cumsum(~gone) - 1)[onto], offset)
@@ -293,6 +249,9 @@ def test_links_join_what_odometry_joined(seed, count, cuts):
     assert np.array_equal(loose, graph.seam.rows[1:] | (graph.cut.rows[1:] >= 0))
 
 
+NO_OFFSET = np.zeros((5, 3))
+
+
 def there_and_back(stream, bias=0.0, turn_error=0.0, noise=0.01, turn=0.2):
     """Keyframes a b a b, each pass with its own noise, and one more; those seen again are merged with the
     first ones. The second pass is driven in reverse: from b to a."""
@@ -301,13 +260,16 @@ def there_and_back(stream, bias=0.0, turn_error=0.0, noise=0.01, turn=0.2):
     true = between(poses[:-1], poses[1:])
     length = np.hypot(*true[:, :2].T) + 0.05
     motion = miscalibrated(true, length, bias, turn_error) + stream.normal(0, noise, (4, 3))
-    graph = empty_graph()
+    graph = new_graph(CELL, GUARD)
     for k, pose in enumerate(poses):
         moved = motion[k - 1] if k else np.zeros(3)
         add(graph, moved, pose, length[k - 1] if k else 0.0, abs(moved[2]) * (1 + 0.5 * k))
     graph.bias, graph.turn_error = bias, turn_error
-    onto = np.array([0, 1, 0, 1, 2])
-    return graph, MergedRows(np.array([0, 1, 4]), onto, np.zeros((5, 3)))
+    return graph, MergedRows(np.array([0, 1, 4]), np.array([0, 1, 0, 1, 2]), NO_OFFSET)
+
+
+def third_with_first(offset=NO_OFFSET):
+    return MergedRows(np.array([0, 1, 3, 4]), np.array([0, 1, 0, 2, 3]), offset)
 
 
 @given(seeds, st.floats(0.5, 4.0), st.sampled_from([0.2, np.pi - 0.002]))
@@ -340,32 +302,15 @@ def test_parallel_links_are_fused_by_their_information(seed, factor, turn):
 
 
 def test_links_of_two_merges_are_fused_as_if_merged_at_once():
-    stream = np.random.default_rng(0)
-    both, merge = there_and_back(stream)
+    both, merge = there_and_back(np.random.default_rng(0))
     stepwise, _ = there_and_back(np.random.default_rng(0))
     merge_keyframes(both, merge)
-    first = MergedRows(np.array([0, 1, 3, 4]), np.array([0, 1, 0, 2, 3]), np.zeros((5, 3)))
-    merge_keyframes(stepwise, first)
+    merge_keyframes(stepwise, third_with_first())
     assert stepwise.seam.rows.tolist() == [False, False, True, False]
     merge_keyframes(stepwise, MergedRows(np.array([0, 1, 3]), np.array([0, 1, 1, 2]), np.zeros((4, 3))))
-    attached = (ATTACHED * CELL) ** 2
     for name in ("i", "j", "motion", "length", "turn", "variance"):
         assert np.allclose(getattr(both.links, name), getattr(stepwise.links, name)), name
-    assert attached < both.links.variance[1, 0]
-
-
-@given(seeds, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
-def test_a_link_driven_in_reverse_is_corrected_as_it_was_driven(seed, bias, turn_error):
-    """The only pass over the link is that from b to a."""
-    graph, _ = there_and_back(np.random.default_rng(seed), bias, turn_error)
-    motion, length = graph.motion.rows[2].copy(), graph.length.rows[2]
-    graph.cut.rows[3] = 0  # and so not the one from a to b
-    merge_keyframes(graph, MergedRows(np.array([0, 1, 3, 4]), np.array([0, 1, 0, 2, 3]), np.zeros((5, 3))))
-    driven = correct_heading(motion, length, bias, turn_error)
-    corrected = graph.fit().corrected_links(graph.links)
-    assert graph.links.i.tolist() == [0]
-    assert graph.links.j.tolist() == [1]
-    assert apart(corrected, inverse(driven)[None]) < 1e-12
+    assert both.links.variance[1, 0] > (ATTACHED * CELL) ** 2
 
 
 @given(seeds, st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), st.booleans())
@@ -376,7 +321,7 @@ def test_links_are_corrected_like_the_odometry_they_are_made_of(seed, bias, turn
     moved, length = graph.motion.rows.copy(), graph.length.rows.copy()
     offset = np.zeros((5, 3))
     offset[2] = [*stream.uniform(-0.05, 0.05, 2), stream.normal(0, 0.2) + np.pi * turned]
-    merge_keyframes(graph, MergedRows(np.array([0, 1, 3, 4]), np.array([0, 1, 0, 2, 3]), offset))
+    merge_keyframes(graph, third_with_first(offset))
     assert list(zip(graph.links.i.tolist(), graph.links.j.tolist(), strict=True)) == [(0, 1), (0, 2)]
     into, onwards = correct_heading(moved[2:4], length[2:4], bias, turn_error)
     expected = [inverse(compose(into, inverse(offset[2]))), compose(offset[2], onwards)]
@@ -386,6 +331,14 @@ def test_links_are_corrected_like_the_odometry_they_are_made_of(seed, bias, turn
     if not bend.max() < 1e-3:
         raw = np.stack([inverse(compose(moved[2], inverse(offset[2]))), compose(offset[2], moved[3])])
         assert found < apart(raw, np.array(expected))  # and not as if it were not corrected
+    # The only pass over the link is that from b to a.
+    graph, _ = there_and_back(np.random.default_rng(seed), bias, turn_error)
+    motion, length = graph.motion.rows[2].copy(), graph.length.rows[2]
+    graph.cut.rows[3] = 0  # and so not the one from a to b
+    merge_keyframes(graph, third_with_first())
+    driven = correct_heading(motion, length, bias, turn_error)
+    assert (graph.links.i.tolist(), graph.links.j.tolist()) == ([0], [1])
+    assert apart(graph.fit().corrected_links(graph.links), inverse(driven)[None]) < 1e-12
 
 
 def test_merged_odometry_still_shows_the_calibration():

@@ -12,10 +12,9 @@ from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.selection_worker import DELAY, THREAD
 from tests.ratslam.mapping.map_cases import LAP, drive, new_map, same, sequence
 
-EVERY = 60
+EVERY, BEGUN = 60, 240
+"""Keyframes between two selections, and at the first with closures to select from."""
 SELECTED = {"select_every": EVERY}
-BEGUN = 4 * EVERY
-"""The first selection with closures to select from."""
 SEEN = sequence(LAP + 2, 2, 80, 5.0)
 LAST = LAP + 90
 
@@ -26,40 +25,22 @@ def whole():
     return drive(new_map(**SELECTED), SEEN, last=LAST)
 
 
-@pytest.fixture
-def held():
-    """Holds the thread back until the event is set."""
-    gate = Event()
-
-    def hold():
-        THREAD.submit(gate.wait, 60)
-
-    yield hold, gate
-    gate.set()
-
-
-def test_a_slow_selection_gives_the_same_bits(held, whole):
-    hold, gate = held
-    slow = drive(new_map(**SELECTED), SEEN, last=BEGUN - 1)
-    hold()
-    drive(slow, SEEN, first=BEGUN - 1, last=BEGUN + DELAY - 1)
-    assert slow.state.unmerged.count > BEGUN  # the session went on while the selection was held back
-    gate.set()
-    assert same(drive(slow, SEEN, first=BEGUN + DELAY - 1, last=LAST), whole)
-
-
-def test_a_selection_in_progress_keeps_its_views_when_the_map_is_restored(held):
-    hold, gate = held
-    map = drive(new_map(**SELECTED), SEEN, last=BEGUN)
-    expected = map.arrays()
-    again = drive(new_map(**SELECTED), SEEN, last=BEGUN - 1)
-    hold()
-    drive(again, SEEN, first=BEGUN - 1, last=BEGUN)
-    selection = again.selection.job.result
-    again.restore(new_map(**SELECTED).arrays())
-    gate.set()
-    for name, value in selection.result(60).arrays().items():
-        assert np.array_equal(value, expected[f"selection/job/result/{name}"], equal_nan=True), name
+@pytest.mark.parametrize("restored", [False, True])
+def test_a_slow_selection_gives_the_same_bits_and_keeps_its_views_when_the_map_is_restored(restored, whole):
+    gate, slow = Event(), drive(new_map(**SELECTED), SEEN, last=BEGUN - 1)
+    THREAD.submit(gate.wait, 60)  # holds the thread back until the event is set
+    drive(slow, SEEN, first=BEGUN - 1, last=BEGUN if restored else BEGUN + DELAY - 1)
+    assert restored or slow.state.unmerged.count > BEGUN  # the session went on meanwhile
+    if restored:
+        selection = slow.selection.job.result
+        slow.restore(new_map(**SELECTED).arrays())
+        gate.set()
+        expected = drive(new_map(**SELECTED), SEEN, last=BEGUN).arrays()
+        for name, value in selection.result(60).arrays().items():
+            assert np.array_equal(value, expected[f"selection/job/result/{name}"], equal_nan=True), name
+    else:
+        gate.set()
+        assert same(drive(slow, SEEN, first=BEGUN + DELAY - 1, last=LAST), whole)
 
 
 @pytest.mark.parametrize("every", [EVERY, 10])
@@ -73,22 +54,14 @@ def test_the_result_is_taken_up_after_the_delay_or_before_the_next_selection(eve
 
     monkeypatch.setattr(selection_worker.SelectedMap, "take_up", take_up)
     drive(new_map(select_every=every), SEEN, last=LAST)
-    if every == EVERY:
-        assert taken == [(BEGUN, DELAY)]
-    else:
-        assert {delay for _, delay in taken} == {every}
-        assert len(taken) > 3
+    assert {delay for _, delay in taken} == {min(every, DELAY)}
+    assert taken == [(BEGUN, DELAY)] if every == EVERY else len(taken) > 3
 
 
-@pytest.mark.parametrize(
-    "at",
-    [
-        pytest.param(BEGUN - 3, marks=pytest.mark.soak),
-        BEGUN + 1,
-        BEGUN + DELAY - 1,
-        pytest.param(BEGUN + DELAY + 1, marks=pytest.mark.soak),
-    ],
-)
+SOAK = [pytest.param(at, marks=pytest.mark.soak) for at in (BEGUN - 3, BEGUN + DELAY + 1)]
+
+
+@pytest.mark.parametrize("at", [BEGUN + 1, BEGUN + DELAY - 1, *SOAK])
 def test_a_checkpoint_during_a_selection_continues_to_the_same_bits(at, whole):
     part = drive(new_map(**SELECTED), SEEN, last=at)
     restored = new_map(**SELECTED)

@@ -9,19 +9,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ratslam.mapping.ground import GainOdds, Ground, Motion, PoseHypothesis, learn_gain_odds
-from tactile.base.se2 import between, compose, wrap
+from tactile.base.se2 import between, compose, integrate, wrap
 
 REACH, REACH_HEADING = 0.06, 0.3
 VARIANCE = np.array([0.04, 0.04, 0.12]) ** 2
 
-POSES = st.builds(
-    lambda x, y, heading: np.array([x, y, heading]), *[st.floats(-9, 9)] * 2, st.floats(-np.pi, np.pi)
-)
+POSES = st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-np.pi, np.pi)).map(np.array)
 VARIANCES = arrays(np.float64, 3, elements=st.sampled_from((0.0, 1e-5, 1e-4, 1e-3, 0.01)))
-MOTIONS = st.builds(
-    lambda x, y, turn, variance: Motion(np.array([x, y, turn]), variance),
-    *[st.floats(-0.3, 0.3)] * 2, st.floats(-0.5, 0.5), VARIANCES,
-)  # fmt: skip
+STEPS = st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.5, 0.5)).map(np.array)
+MOTIONS = st.builds(Motion, STEPS, VARIANCES)
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -45,11 +41,7 @@ def assert_same_pose(found: np.ndarray, expected: np.ndarray, tolerance: float =
 
 
 class Loop(NamedTuple):
-    """A square loop whose places all look different.
-
-    Attributes:
-        poses: [N, 3] of its keyframes, 0.05 m apart.
-    """
+    """A square loop whose places all look different: poses [N, 3] of its keyframes, 0.05 m apart."""
 
     poses: np.ndarray
 
@@ -72,13 +64,11 @@ class Loop(NamedTuple):
         return gain.astype(np.float32)
 
 
-def square_loop(side: int = 20) -> Loop:
-    """A square with `side` keyframes along each edge."""
-    step, turn = np.array([0.05, 0.0, 0.0]), np.array([0.05, 0.0, np.pi / 2])
-    poses = [np.zeros(3)]
-    for k in range(1, 4 * side):
-        poses.append(compose(poses[-1], step if k % side else turn))
-    return Loop(np.array(poses))
+def square_loop() -> Loop:
+    """A square with 20 keyframes along each edge."""
+    motion = np.array([[0.05, 0.0, 0.0]] * 79)
+    motion[19::20, 2] = np.pi / 2
+    return Loop(np.vstack([np.zeros(3), integrate(motion)]))
 
 
 def odds_of(true: float = 2.0, false: float = -0.3) -> GainOdds:

@@ -15,17 +15,11 @@ from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.filter import recognise, view_cells
 from ratslam.recall.memory import MapFeedback, init_memory
 
-CELL = 0.1
-SIZE = 12
-CAPACITY = 64
-GUARD = 5
-SEEDS = range(16)
-ANGLE = 0.15
+CELL, SIZE, CAPACITY, GUARD, SEEDS, ANGLE = 0.1, 12, 64, 5, range(16), 0.15
 FAN = RecallConfig(sector_fov="auto", guard=GUARD)
 FLAT = RecallConfig(sector_fov="none", guard=GUARD)
-ROW = 36, 13, 168
-"""Cells of a network in which no two places of `spaced` share one."""
-SMALL = 12, 13, 13
+ROW, SMALL = (36, 13, 168), (12, 13, 13)
+"""Cells of networks; in the first one no two places of `spaced` share one."""
 
 
 def network_of(config, cell=CELL, shape=ROW):
@@ -34,48 +28,31 @@ def network_of(config, cell=CELL, shape=ROW):
     return Network(cells, config.excite, config.excite_heading, config.miss, config.leak)
 
 
-def filled(
-    config,
-    views,
-    poses,
-    *,
-    labels=None,
-    bias=0.0,
-    turn_error=0.0,
-    since=0.0,
-    angle=0.0,
-    scale=0.1,
-    dtype=float,
-    capacity=CAPACITY,
-):
-    """A memory of frames [N, D] at poses [N, 3]; the robot is at the newest."""
-    count = len(poses)
-    store = np.zeros((views.shape[1], capacity))
+def filled(config, views, poses, *, labels=None, scale=0.1, dtype=float, **calibration):
+    """A memory of frames [N, D] at poses [N, 3]; the robot is at the newest. `calibration`: bias, turn_error,
+    since and angle, by default 0."""
+    count, store, ids = len(poses), np.zeros((views.shape[1], CAPACITY)), np.full(CAPACITY, -1, np.int32)
     store[:, :count] = views.T
-    ids = np.full(capacity, -1, np.int32)
     ids[:count] = -1 if labels is None else labels
-    memory = init_memory(config, views.shape[1], capacity, np.dtype(dtype))._replace(
-        view=jnp.asarray(store, dtype),
-        label=jnp.asarray(ids),
-        count=jnp.int32(count),
+    memory = init_memory(config, views.shape[1], CAPACITY, np.dtype(dtype))._replace(
+        view=jnp.asarray(store, dtype), label=jnp.asarray(ids), count=jnp.int32(count),
         distinct=jnp.int32(len(set(ids[ids >= 0].tolist()))),
-    )
-    return memory.apply_map_feedback(MapFeedback(poses, bias, turn_error, since, angle, scale))
+    )  # fmt: skip
+    feedback = {"bias": 0.0, "turn_error": 0.0, "since": 0.0, "angle": 0.0} | calibration
+    return memory.apply_map_feedback(MapFeedback(poses=poses, scale=scale, **feedback))
 
 
 def holding(config, memory, masses=None, cell=CELL, shape=ROW):
     """The belief that gives these masses, by keyframe, to view cells of shift 0; the rest is novelty."""
     shifts = sector_shifts(config).tolist()
     mass = np.zeros((len(shifts), len(memory.label)))
-    for frame, value in (masses or {}).items():
-        mass[shifts.index(0), frame] = value
+    mass[shifts.index(0), list(masses or ())] = list((masses or {}).values())
     return believing(config, memory, mass, cell, shape)
 
 
 def believing(config, memory, mass, cell=CELL, shape=ROW):
     """The belief of masses [S, C] of the view cells."""
-    mass = jnp.asarray(mass, jnp.float32)
-    silent = Belief(jnp.zeros(shape, jnp.float32), mass)
+    silent = Belief(jnp.zeros(shape, jnp.float32), jnp.asarray(mass, jnp.float32))
     return anchoring(config, network_of(config, cell, shape))(memory, silent)
 
 
@@ -102,9 +79,8 @@ def compile_label_filter(config):
 
     def read(memory, belief, label):
         weighed = observation_model.label_likelihood(config, memory, label)
-        return *recognise(
-            config, network, memory, belief, memory.corrected_motion(), weighed, config.local
-        ), weighed
+        motion = memory.corrected_motion()
+        return *recognise(config, network, memory, belief, motion, weighed, config.local), weighed
 
     return jax.jit(read)
 
@@ -116,9 +92,9 @@ def observe(config, memory, view, belief=None, cell=CELL):
     return jax.tree.map(np.asarray, look(memory, belief, jnp.asarray(view, memory.x.dtype)))
 
 
-def spaced(count, cells=4.0):
+def spaced(count, cells=4.0, cell=CELL):
     """Poses in a row so far apart that no frame is near another."""
-    return np.stack([np.arange(count) * cells * CELL, np.zeros(count), np.zeros(count)], axis=1)
+    return np.outer(np.arange(count) * cells * cell, [1.0, 0.0, 0.0])
 
 
 def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
@@ -142,14 +118,11 @@ def random_case(seed, config=FAN, angle=ANGLE, dtype=float):
     shifts = stream.integers(0, len(mass), 4) if angle else np.full(4, len(mass) // 2)
     np.add.at(mass, (shifts, frames), stream.dirichlet(np.full(5, 0.7))[:-1])
     belief = believing(config, memory, mass, shape=SMALL)
-    memory = memory.accumulate_motion(jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
-    memory = memory.accumulate_motion(jnp.asarray(stream.normal(0, [CELL, 0.2 * CELL, 0.1]), dtype))
+    for motion in stream.normal(0, [CELL, 0.2 * CELL, 0.1], (2, 3)):
+        memory = memory.accumulate_motion(jnp.asarray(motion, dtype))
     heaviest = frames[int(mass[shifts, frames].argmax())]
     near = np.roll(views[heaviest], int(stream.choice([-2, -1, 0, 0, 0, 1, 2])))
     return memory, belief, np.clip(0.6 * near + 0.4 * stream.random(SIZE), 0, 1)
-
-
-# The loops
 
 
 def errors_by_loops(config, m, view):

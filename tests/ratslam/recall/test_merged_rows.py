@@ -9,8 +9,7 @@ import pytest
 from ratslam.recall.config import RecallConfig
 from ratslam.recall.memory import MergedRows, init_memory
 
-TOUCH = RecallConfig(sector_fov="whiskers")
-FAN = RecallConfig(sector_fov="auto")
+TOUCH, FAN = RecallConfig(sector_fov="whiskers"), RecallConfig(sector_fov="auto")
 SIZE, CAPACITY, COUNT = 6, 32, 20
 PLACED = "x", "y", "heading", "cosine", "sine"
 
@@ -44,22 +43,13 @@ def test_rows_are_those_that_remain(seed, config):
     stream = np.random.default_rng(seed)
     memory, merged = random_memory(stream, config), random_merge(stream)
     after, rows = memory.merge_rows(merged), len(merged.source)
-    assert int(after.count) == rows
-    assert np.array_equal(np.asarray(after.view)[:, :rows], merged.view.T)
-    assert np.array_equal(np.asarray(after.label)[:rows], merged.label)
-    for name in PLACED:
-        assert np.array_equal(np.asarray(getattr(after, name))[:rows], getattr(memory, name)[merged.source])
-    if config is TOUCH:
-        assert np.array_equal(np.asarray(after.before)[:, :rows], memory.before[:, merged.source])
-
-    assert not np.asarray(after.view)[:, rows:].any()
-    assert (np.asarray(after.label)[rows:] == -1).all()
-    for name in (*PLACED, "before"):
-        assert not np.asarray(getattr(after, name))[..., rows:].any(), name
-    for name in ("distinct", "pose", "motion", "length", "turn", "bias", "turn_error", "since", "angle"):
-        assert np.array_equal(getattr(after, name), getattr(memory, name)), name
-    assert np.array_equal(after.likeness, memory.likeness)
-    assert float(after.scale) == float(memory.scale)
+    source = np.append(merged.source, np.full(CAPACITY - rows, COUNT))  # rows from there on are empty
+    expected = {name: getattr(memory, name)[source] * (source < COUNT) for name in PLACED}
+    expected |= {"count": rows, "view": np.pad(merged.view.T, ((0, 0), (0, CAPACITY - rows)))}
+    expected["label"] = np.append(merged.label, np.full(CAPACITY - rows, -1))
+    expected["before"] = memory.before[..., source] * (source < COUNT) if config is TOUCH else memory.before
+    for name, was in memory._asdict().items():
+        assert np.array_equal(getattr(after, name), expected.get(name, was)), name
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -67,26 +57,20 @@ def test_shapes_and_dtypes_stay(dtype):
     stream = np.random.default_rng(0)
     memory, merged = random_memory(stream, TOUCH, dtype), random_merge(stream)
     after = memory.merge_rows(merged)
-    assert jax.tree.map(np.shape, after) == jax.tree.map(np.shape, memory)
-    assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, memory)
+    one, other = (jax.tree.map(lambda x: (np.shape(x), x.dtype), each) for each in (after, memory))
+    assert one == other
     leaves = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(after) if isinstance(leaf, jax.Array)]
     assert len(set(leaves)) == len(leaves)  # one buffer each, because the session donates them
 
 
-def test_merged_keyframes_can_be_restored():
+def test_merged_keyframes_can_be_restored_but_no_more_than_the_memory_holds():
     """Twice as many rows: each former one comes back beside the one that it was merged with."""
-    stream = np.random.default_rng(0)
-    memory, count = random_memory(stream, TOUCH, count=10), 10
-    source = np.repeat(np.arange(count), 2)
-    views = stream.integers(1, 5, (2 * count, SIZE)), np.arange(2 * count)
-    after = memory.merge_rows(MergedRows(source, 2 * np.arange(count), np.zeros((count, 3)), *views))
-    assert int(after.count) == 2 * count
-    for begin in (0, 1):
-        assert np.array_equal(np.asarray(after.x)[begin : 2 * count : 2], memory.x[:count])
-
-
-def test_more_rows_than_the_memory_holds_are_refused():
-    memory = random_memory(np.random.default_rng(0), TOUCH)
+    stream, source = np.random.default_rng(0), np.repeat(np.arange(10), 2)
+    memory, views = random_memory(stream, TOUCH, count=10), (stream.integers(1, 5, (20, SIZE)), np.arange(20))
+    after = memory.merge_rows(MergedRows(source, 2 * np.arange(10), np.zeros((10, 3)), *views))
+    assert int(after.count) == 20
+    assert np.array_equal(np.asarray(after.x)[:20], memory.x[source])
+    memory = random_memory(stream, TOUCH)
 
     def rows(count):
         source = np.minimum(np.arange(count), COUNT - 1)

@@ -1,4 +1,4 @@
-"""Laws of recall by whisker images."""
+"""Laws of recall by whisker images, of their levels, and of their likelihood by slow sums over the pixels."""
 
 from __future__ import annotations
 
@@ -12,57 +12,39 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ratslam.recall import whisker_likelihood as touch
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.filter import place_of, recognise
 from ratslam.recall.memory import MapFeedback, init_memory
 from ratslam.recall.observation_model import STEPS, touch_likelihood
-from ratslam.recall.whisker_likelihood import (
-    DEAD,
-    HEIGHTS,
-    LEVELS,
-    PRIOR,
-    estimate_background,
-    log_odds_table,
-    pixel_layout,
-)
-from tests.ratslam.recall.recall_cases import believing, holding, network_of
+from tactile.whisker_geometry import HeadConfig, ur10_head
+from tests.ratslam.recall.recall_cases import believing, holding, network_of, spaced
 
-CELL = 0.05
-SHAPE = (3, 6, 1)
-PIXELS = pixel_layout(SHAPE)
+CELL, SHAPE, GUARD, CAPACITY, NEW_IMAGE_LOG_ODDS = 0.05, (3, 6, 1), 5, 64, 3.0
+PIXELS = touch.pixel_layout(SHAPE)
 SIZE = len(PIXELS.group)
-GUARD = 5
-CAPACITY = 64
-NEW_IMAGE_LOG_ODDS = 3.0
 BOTH = RecallConfig(sector_fov="whiskers", guard=GUARD)
 AHEAD = BOTH.model_copy(update={"shifts": 0})
-SEEDS = range(8)
+SEEDS, seeds = range(8), st.integers(0, 10_000)
 
 
 def images_of(stream, count, touching=0.4, dead=0.0):
     """[count, D] levels."""
-    level = stream.integers(1, DEAD, (count, SIZE)) * (stream.random((count, SIZE)) < touching)
-    return np.where(stream.random((count, SIZE)) < dead, DEAD, level)
+    level = stream.integers(1, touch.DEAD, (count, SIZE)) * (stream.random((count, SIZE)) < touching)
+    return np.where(stream.random((count, SIZE)) < dead, touch.DEAD, level)
 
 
 def learn(images):
     """The log-odds table learned from these images."""
-    return log_odds_table(estimate_background(images, PIXELS.group), PRIOR)
+    return touch.log_odds_table(touch.estimate_background(images, PIXELS.group), touch.PRIOR)
 
 
-def filled(config, images, poses, likeness, *, scale=NEW_IMAGE_LOG_ODDS, dtype=float):
+def filled(config, images, poses, likeness, scale=NEW_IMAGE_LOG_ODDS):
     """A memory of frames [N, D] at poses [N, 3]; the robot is at the newest."""
-    count = len(poses)
-    memory = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), len(likeness))
-    store = np.zeros((SIZE, CAPACITY), np.int32)
-    store[:, :count] = images.T
-    memory = memory._replace(view=jnp.asarray(store), count=jnp.int32(count))
+    memory = init_memory(config, SIZE, CAPACITY, np.dtype(float), len(likeness))
+    view = jnp.asarray(np.pad(images.T, ((0, 0), (0, CAPACITY - len(poses)))), jnp.int32)
+    memory = memory._replace(view=view, count=jnp.int32(len(poses)))
     return memory.apply_map_feedback(MapFeedback(poses, 0.0, 0.0, 0.0, np.pi, scale, likeness))
-
-
-def spaced(count, cells=4.0):
-    """Poses in a row so far apart that no frame is near another."""
-    return np.stack([np.arange(count) * cells * CELL, np.zeros(count), np.zeros(count)], axis=1)
 
 
 def random_case(seed, config=BOTH):
@@ -104,36 +86,27 @@ def filter_of(config):
     return jax.jit(observe)
 
 
-def host(tree):
-    return jax.tree.map(np.asarray, tree)
+def on_host(function, memory, *belief, level):
+    return jax.tree.map(np.asarray, function(memory, *belief, jnp.asarray(level, jnp.int32)))
 
 
 def weigh(config, memory, level):
-    return host(compile_likelihood(config)(memory, jnp.asarray(level, jnp.int32)))
+    return on_host(compile_likelihood(config), memory, level=level)
 
 
 def observe(config, memory, level, belief=None):
     """The memory and the belief after an image, and the result; without a belief all is novelty."""
     belief = holding(config, memory, cell=CELL) if belief is None else belief
-    return host(filter_of(config)(memory, belief, jnp.asarray(level, jnp.int32)))
-
-
-seeds = st.integers(0, 10_000)
-
-# The posterior is a distribution
+    return on_host(filter_of(config), memory, belief, level=level)
 
 
 @settings(max_examples=30)
-@given(seeds, st.sampled_from([BOTH, AHEAD]), st.sampled_from(["known", "other", "silent", "dead", "full"]))
-def test_mass_is_conserved(seed, config, kind):
-    memory, belief, level = random_case(seed, config)
-    level = {
-        "known": level,
-        "other": images_of(np.random.default_rng(seed + 1), 1)[0],
-        "silent": np.zeros(SIZE, int),
-        "dead": np.full(SIZE, DEAD),
-        "full": np.full(SIZE, HEIGHTS),
-    }[kind]
+@given(seeds, st.sampled_from([BOTH, AHEAD]), st.sampled_from([None, "other", 0, touch.DEAD, touch.HEIGHTS]))
+def test_mass_is_conserved(seed, config, level):
+    """Of a known image, of another, and of all whiskers silent, dead or bent fully."""
+    memory, belief, known = random_case(seed, config)
+    other = images_of(np.random.default_rng(seed + 1), 1)[0]
+    level = known if level is None else other if level == "other" else np.full(SIZE, level)
     _, after, found = observe(config, memory, level, belief)
     assert (after.activity >= 0).all()
     assert after.activity.sum() + found.novelty == pytest.approx(1, abs=1e-5)
@@ -141,22 +114,12 @@ def test_mass_is_conserved(seed, config, kind):
     assert 0 <= found.second <= 1 - found.posterior + 1e-5
 
 
-# Images without evidence
-
-
-def test_a_head_of_dead_whiskers_recognises_no_place():
-    memory, *_ = random_case(1)
-    found = weigh(BOTH, memory, np.full(SIZE, DEAD))[1]
-    assert (found.likelihood[:, : int(memory.count) - GUARD] == 1).all()
-    assert found.novelty >= 1
-
-
 @pytest.mark.parametrize("config", [BOTH, AHEAD])
-def test_nothing_is_recognised_without_frames_or_log_odds(config):
+def test_nothing_is_recognised_without_frames_or_log_odds_or_by_dead_whiskers(config):
     images = images_of(np.random.default_rng(0), 40)
     learnt = learn(images)
-    empty = filled(config, images[:GUARD], spaced(GUARD), learnt)
-    untaught = filled(config, images, spaced(40), np.zeros(learnt.shape), scale=0.0)
+    empty = filled(config, images[:GUARD], spaced(GUARD, cell=CELL), learnt)
+    untaught = filled(config, images, spaced(40, cell=CELL), np.zeros(learnt.shape), scale=0.0)
     for memory in (empty, untaught):
         after, found = weigh(config, memory, images[7])
         assert not found.certain
@@ -166,28 +129,29 @@ def test_nothing_is_recognised_without_frames_or_log_odds(config):
         assert not after.before.any()
         _, _, one = observe(config, memory, images[7])
         assert (one.match, one.log_ratio, one.posterior, one.novelty, one.view_fits) == (-1, 0, 0, 1, -1)
-    taught = filled(config, images, spaced(40), learnt)
+    taught = filled(config, images, spaced(40, cell=CELL), learnt)
     assert observe(config, taught, images[7])[-1].match == 7
+    memory, *_ = random_case(1)
+    found = weigh(BOTH, memory, np.full(SIZE, touch.DEAD))[1]
+    assert (found.likelihood[:, : int(memory.count) - GUARD] == 1).all()
+    assert found.novelty >= 1
 
 
 def test_only_whiskers_have_arrays_for_their_history():
     for config, rows in ((BOTH, 2), (AHEAD, 1)):
         memory = init_memory(config, SIZE, CAPACITY, np.dtype(float), 3)
         assert memory.before.shape == (rows, CAPACITY)
-        assert memory.likeness.shape == (3, LEVELS, LEVELS)
+        assert memory.likeness.shape == (3, touch.LEVELS, touch.LEVELS)
         assert memory.view.dtype == np.int32
     for fan in ("auto", "none", 1.0):
         memory = init_memory(RecallConfig(sector_fov=fan), SIZE, CAPACITY, np.dtype(float))
         assert memory.before.size == memory.likeness.size == 0
 
 
-# Recognition
-
-
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_head_turned_by_half_a_turn_is_recognised_with_its_heading(turned):
     images = images_of(np.random.default_rng(0), 40)
-    memory = filled(BOTH, images, spaced(40), learn(images))
+    memory = filled(BOTH, images, spaced(40, cell=CELL), learn(images))
     for place in (0, 11, 34):
         now = images[place][PIXELS.opposite] if turned else images[place]
         _, after, found = observe(BOTH, memory, now)
@@ -196,26 +160,21 @@ def test_a_head_turned_by_half_a_turn_is_recognised_with_its_heading(turned):
         assert np.unravel_index(after.mass.argmax(), after.mass.shape) == (turned, place)
         heading = place_of(memory, jax.tree.map(jnp.asarray, found))[2]
         assert math.cos(float(heading)) == pytest.approx(-1 if turned else 1, abs=1e-6)
-        alone = observe(AHEAD, filled(AHEAD, images, spaced(40), learn(images)), now)[-1]
+        alone = observe(AHEAD, filled(AHEAD, images, spaced(40, cell=CELL), learn(images)), now)[-1]
         assert alone.shift == 0
         assert (alone.match == place and alone.log_ratio > 0) != turned
 
 
-# Explicit loops over the equations
-
-
 def likelihood_by_loops(config, memory, level):
     """Likelihoods [S, C] and the likelihood of novelty, pixel by pixel."""
-    m = host(memory)
+    m = jax.tree.map(np.asarray, memory)
     old = range(int(m.count) - config.guard)
     turned = len(m.before) > 1
     likelihood = np.zeros(m.before.shape)
     for c in old:
         for s in range(1 + turned):
-            odds = 0.0
-            for d in range(SIZE):
-                then = m.view[PIXELS.opposite[d] if s else d, c]
-                odds += m.likeness[PIXELS.group[d], level[d], then]
+            then = [m.view[PIXELS.opposite[d] if s else d, c] for d in range(SIZE)]
+            odds = sum(m.likeness[PIXELS.group[d], level[d], then[d]] for d in range(SIZE))
             likelihood[s, c] = math.exp(config.temper * odds)
     weight, familiar = 0.0, 0.0
     for s in range(1 + turned):
@@ -242,5 +201,107 @@ def test_likelihoods_equal_explicit_loops(config):
         assert np.array_equal(after.before, found.likelihood)
         assert found.certain == found.informative == (int(memory.count) > GUARD)
         assert np.isnan(found.background).all()
-        same = jax.tree.map(np.array_equal, after._replace(before=memory.before), host(memory))
+        same = jax.tree.map(np.array_equal, after._replace(before=memory.before), memory)
         assert all(jax.tree.leaves(same))
+
+
+share = st.floats(0.001, 0.999)
+visits = st.builds(touch.Variation, share, share, st.floats(0.005, 1.0), share)
+
+
+@given(st.tuples(st.integers(1, 4), st.integers(1, 9), st.integers(1, 3)))
+def test_pixels_of_a_ring_and_channel_are_one_group(shape):
+    known = touch.pixel_layout(shape)
+    group = known.group.reshape(shape)
+    assert (group == group[:, :1]).all()
+    assert np.unique(group).tolist() == list(range(shape[0] * shape[2]))
+    assert np.array_equal(np.sort(known.opposite), np.arange(group.size))
+    assert np.array_equal(known.group[known.opposite], known.group)
+
+
+@pytest.mark.parametrize("columns", [2, 4, 6, 8])
+def test_the_opposite_pixel_is_that_of_the_opposite_whisker(columns):
+    head = ur10_head(HeadConfig(whiskers=columns, first_deg=17.0))
+    behind = touch.pixel_layout((*head.shape, 1)).opposite
+    assert np.allclose(head.rest[behind, :2], -head.rest[:, :2], atol=1e-12)
+    assert np.allclose(head.base[behind, 2], head.base[:, 2])
+
+
+@given(st.lists(st.floats(-1, 2), min_size=1, max_size=20), seeds)
+def test_levels_are_thirtieths_rounded_up_and_negative_values_are_silent(values, seed):
+    view, alive = np.array(values), np.random.default_rng(seed).random(len(values)) < 0.7
+    expected = [min(max(math.ceil(value * 30), 0), 30) for value in values]
+    assert touch.pixel_levels(view, alive).tolist() == np.where(alive, expected, 31).tolist()
+    assert (touch.HEIGHTS, touch.DEAD, touch.LEVELS) == (30, 31, 32)
+
+
+@given(seeds)
+def test_levels_are_the_same_on_the_host_and_in_the_kernel(seed):
+    stream = np.random.default_rng(seed)
+    view, alive = stream.random(SIZE) * (stream.random(SIZE) < 0.5), stream.random(SIZE) < 0.8
+    levels = touch.pixel_levels(jnp.asarray(view), jnp.asarray(alive, float))
+    assert np.array_equal(touch.pixel_levels(view, alive), np.asarray(levels))
+    single = touch.pixel_levels(jnp.asarray(view, jnp.float32), jnp.asarray(alive, jnp.float32))
+    assert single.dtype == jnp.float32
+    assert np.abs(np.asarray(single) - np.asarray(levels)).max() <= 1  # rounding, at a border between levels
+
+
+@given(seeds, st.integers(0, 20), st.floats(0, 1), st.floats(0, 1))
+def test_the_background_counts_by_ring_and_channel_what_is_not_dead(seed, count, touching, dead):
+    """As if there had been four more pixels, one of them in contact, and one more of each height."""
+    level = images_of(np.random.default_rng(seed), count, touching, dead)
+    found = touch.estimate_background(level, PIXELS.group)
+    for group in range(3):
+        silent, *heights = np.bincount(level[:, group == PIXELS.group].ravel(), minlength=32)[:31]
+        assert found[0][group] == pytest.approx((sum(heights) + 1) / (silent + sum(heights) + 4))
+        assert found[1][group] == pytest.approx((np.array(heights) + 1) / (sum(heights) + 30))
+
+
+def variation_by_loops(now, then):
+    """Shares and heights of the pixels of pairs, and of a prior of twenty half pairs; an outlier may have any
+    height, others differ by an exponential distribution."""
+    alive, weight = (now != touch.DEAD) & (then != touch.DEAD), 20 * now.shape[1] / 2
+    silent, touching = now[alive & (then == 0)], now[alive & (then > 0)]
+    appears = ((silent > 0).sum() + weight * touch.PRIOR.appears) / (len(silent) + weight)
+    vanishes = ((touching == 0).sum() + weight * touch.PRIOR.vanishes) / (len(touching) + weight)
+    apart = np.abs(now - then)[alive & (now > 0) & (then > 0)] / 30
+    width, outliers = touch.PRIOR.width, touch.PRIOR.outliers
+    for _ in range(20):
+        loose = outliers / (outliers + (1 - outliers) * np.exp(-apart / width) / (2 * width))
+        outliers = (loose.sum() + weight * touch.PRIOR.outliers) / (len(apart) + weight)
+        width = ((1 - loose) @ apart + weight * touch.PRIOR.width) / (len(apart) - loose.sum() + weight)
+    return touch.Variation(appears, vanishes, width, outliers)
+
+
+@given(seeds, st.integers(0, 40), st.floats(0, 1))
+def test_the_variation_is_estimated_from_pairs_and_a_prior(seed, count, dead):
+    stream = np.random.default_rng(seed)
+    then, other = images_of(stream, count, dead=dead), images_of(stream, count, dead=0.1)
+    near = np.clip(then + stream.integers(-2, 3, then.shape), 1, touch.HEIGHTS)
+    now = np.where(stream.random(then.shape) < 0.7, near, other)
+    assert touch.estimate_variation(now, then) == pytest.approx(variation_by_loops(now, then), rel=1e-9)
+    assert touch.estimate_variation(then[:0], then[:0]) == pytest.approx(touch.PRIOR, rel=1e-12)
+
+
+@given(seeds, visits)
+def test_odds_follow_from_one_distribution(seed, visits):
+    """Given an earlier level, probabilities of the levels at the same place sum to 1; a dead pixel carries no
+    evidence."""
+    stream = np.random.default_rng(seed)
+    touching, heights = stream.uniform(0.02, 0.98, 3), stream.dirichlet(np.full(touch.HEIGHTS, 0.5), 3) + 1e-9
+    heights = heights / heights.sum(axis=1, keepdims=True)
+    log = touch.log_odds_table((touching, heights), visits)
+    assert log.shape == (3, touch.LEVELS, touch.LEVELS)
+    assert not log[:, touch.DEAD].any()
+    assert not log[:, :, touch.DEAD].any()
+    near = np.exp(-np.abs(np.arange(30)[:, None] - np.arange(30)) / 30 / visits.width)
+    near = near / near.sum(axis=0)
+    for group in range(3):
+        background = np.concatenate([[1 - touching[group]], touching[group] * heights[group]])
+        again = background[:, None] * np.exp(log[group, : touch.DEAD, : touch.DEAD])
+        assert np.allclose(again.sum(axis=0), 1, rtol=1e-9)
+        assert again[0, 0] == pytest.approx(1 - visits.appears)
+        assert again[0, 1:] == pytest.approx(np.full(30, visits.vanishes))
+        mixed = (1 - visits.outliers) * near + visits.outliers * heights[group][:, None]
+        assert np.allclose(again[1:, 1:], (1 - visits.vanishes) * mixed, rtol=1e-6)
+        assert np.allclose(again[1:, 0], visits.appears * heights[group], rtol=1e-6)
