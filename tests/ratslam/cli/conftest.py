@@ -9,5 +9,4 @@ from tests.helpers.square_run import copy_square_run
 
 @pytest.fixture(scope="module")
 def square(tmp_path_factory):
-    """A finished run."""
     return copy_square_run(tmp_path_factory.mktemp("square") / "run")

@@ -114,7 +114,6 @@ def write_recordings(folder: Path) -> dict[Path, dict[str, Any]]:
 
 
 def shares(few: int, many: int) -> Any:
-    """A few seeds for every day, and many for the soak."""
     soak = pytest.param(range(many), marks=pytest.mark.soak)
     return pytest.mark.parametrize("seeds", [range(few), soak], ids=["few", "many"])
 
@@ -269,7 +268,6 @@ TOO_LARGE = {
     "run whisker_maze --set simulation.motion.speed=1e-9": "1000000",
     "run rat_box --set rat_simulation.rate_hz=1e9": "1000000",
 }
-"""Commands, and words of their errors."""
 
 
 @pytest.mark.parametrize(("command", "words"), TOO_LARGE.items())

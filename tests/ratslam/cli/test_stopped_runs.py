@@ -1,40 +1,46 @@
-"""Interrupted runs are scored and continue; killed ones are readable."""
+"""Stopped runs are scored or readable, and continue; a stopped undo is none, or can be completed."""
 
 from __future__ import annotations
 
+import errno
 import gc
 import json
+import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ratslam.cli import main
 from ratslam.runs.build_session import open_observations
+from ratslam.runs.map_care import map_info, undo_sequence
 from ratslam.runs.run import catch_interrupt, process_source
 from ratslam.runs.runner import open_runner
+from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import load_config
-from tests.helpers.commands import ROOT
+from tactile.base import files
+from tactile.base.errors import InputError
+from tests.helpers.commands import ROOT, refused, said
+from tests.helpers.square_run import copy_square_run
 
 
 @pytest.fixture(scope="module")
 def corridor(tmp_path_factory):
     """A config that runs for some seconds, and its uninterrupted run."""
     folder = tmp_path_factory.mktemp("corridor")
-    config = folder / "long.yaml"
-    golden = ROOT / "tests" / "golden" / "c_corridor_wrap.npz"
+    config, golden = folder / "long.yaml", ROOT / "tests" / "golden" / "c_corridor_wrap.npz"
     config.write_text(
         f"recording: {{file: {golden}}}\npose_cells: {{cells_xy: 61, cells_heading: 9, cell_size: 0.3}}\n"
         "recall: {frame_distance: 0.05}\n"
     )
-    with (
-        open_observations(load_config(config)) as (completed, source),
-        open_runner(completed, source, folder / "whole") as runner,
-    ):
-        assert not process_source(runner, source)
+
+    with open_observations(load_config(config)) as opened, open_runner(*opened, folder / "whole") as runner:
+        assert not process_source(runner, opened[1])
         runner.finish(interrupted=False)
     session = runner.session
     assert session.backend.rows(session.state) > 256, "fits into the smallest capacity"
@@ -43,7 +49,6 @@ def corridor(tmp_path_factory):
 
 
 def start(config, directory):
-    """The program in a process of its own."""
     command = [sys.executable, "-m", "ratslam", "run", str(config), "-o", str(directory)]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
@@ -59,18 +64,17 @@ def wait_for_steps(process, directory, size=400):
 def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path):
     """By SIGTERM, which does what Ctrl-C does but for the code."""
     config, whole = corridor
-    process = start(config, tmp_path / "first")
-    wait_for_steps(process, tmp_path / "first")
+    first, second = tmp_path / "first", tmp_path / "second"
+    process = start(config, first)
+    wait_for_steps(process, first)
     process.send_signal(signal.SIGTERM)
     _, messages = process.communicate()
-    first = tmp_path / "first"
     assert process.returncode == 143, messages
     assert json.loads((first / "manifest.json").read_text())["status"] == "interrupted"
     # No closure yet, and so no views of one.
     later = {"closure_views.npz", "calibration.yaml"}
     assert {path.name for path in first.iterdir()} == {path.name for path in whole.iterdir()} - later
     assert len((first / "closures.csv").read_text().splitlines()) == 1
-    second = tmp_path / "second"
     assert main(["run", str(config), "--continue", str(first / "map.npz"), "-o", str(second)]) == 0
     added = (second / "steps.csv").read_text().split("\n", 1)[1]
     assert (first / "steps.csv").read_text() + added == (whole / "steps.csv").read_text()
@@ -80,7 +84,7 @@ def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path):
 def test_a_second_interrupt_is_not_lost_in_the_garbage_collector():
     """Python prints what callbacks of the collector raise (JAX has one) and goes on."""
 
-    def interrupt(phase, info):
+    def interrupt(*_):
         signal.raise_signal(signal.SIGINT)
 
     def collect():
@@ -107,33 +111,10 @@ def check_killed_run(corridor, directory):
     return rows
 
 
-@pytest.mark.soak
-def test_fifty_killed_runs_are_readable(corridor, tmp_path):
-    began = time.monotonic()
-    start(corridor[0], tmp_path / "timed").communicate()
-    whole = time.monotonic() - began  # a busy machine takes longer
-    rows = []
-    for k, delay in enumerate(whole * np.random.default_rng(0).uniform(0.1, 1.0, 50)):
-        process = start(corridor[0], tmp_path / str(k))
-        try:
-            process.communicate(timeout=delay)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
-        rows.append(check_killed_run(corridor, tmp_path / str(k)))
-    print("rows left by each kill:", rows)
-    assert sum(count > 1 for count in rows) > 10
-
-
 def kill_and_continue(config, whole, directory, moment):
-    """Kills a run at a share of its steps, or so many s after its last step, and compares the continued one.
-
-    Args:
-        moment: share of the final size of steps.csv; above 1: one more than a time, s.
-    """
+    """Kills a run at a share of its steps (above 1: that much less 1, s, after the last) and continues it."""
     killed, rest = directory / "killed", directory / "rest"
-    process = start(config, killed)
-    size = (whole / "steps.csv").stat().st_size
+    process, size = start(config, killed), (whole / "steps.csv").stat().st_size
     wait_for_steps(process, killed, min(moment, 1.0) * size - 1)
     if moment > 1:
         time.sleep(moment - 1)
@@ -172,3 +153,145 @@ def test_thirty_killed_runs_of_the_maze_continue_to_the_same_bits(number, tmp_pa
     moment = 1.15 * np.random.default_rng(0).random(30)[number]  # with the writing of the results
     moment = moment if moment < 1 else 1 + 20 * (moment - 1)
     print("continued after step", kill_and_continue("whisker_maze", whole, tmp_path, moment))
+
+
+MAKE = """
+import os, signal, sys
+from collections.abc import Callable
+from pathlib import Path
+from tactile.base import files
+
+left = int(sys.argv[2])
+
+def stop(event, arguments):
+    global left
+    if event in ("os.rename", "os.remove"):
+        left -= 1
+        if left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+def change(folder):
+    for file in list(folder.iterdir()):
+        file.unlink()
+        if file.name != "gone":
+            file.write_text("new")
+    (folder / "more").write_text("new")
+
+sys.addaudithook(stop)
+files.change_folder(Path(sys.argv[1]), "change", "a", change)
+"""
+"""Changes a folder, and kills itself before the given one of the moments at which it renames or removes
+something."""
+OLD, NEW = dict.fromkeys(("a", "b", "gone"), "old"), dict.fromkeys(("a", "b", "more"), "new")
+
+
+def seen(folder: Path) -> dict[str, str]:
+    return {file.name: file.read_text() for file in folder.iterdir() if file.is_file()}
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def test_a_change_that_is_killed_at_any_moment_is_none_or_can_be_completed(tmp_path: Path) -> None:
+    completed = []
+    for moment in range(30):
+        folder = tmp_path / str(moment)
+        folder.mkdir()
+        for name, text in OLD.items():
+            (folder / name).write_text(text)
+        code = subprocess.run([sys.executable, "-c", MAKE, str(folder), str(moment)]).returncode
+        if code == 0:
+            break
+        assert code == -signal.SIGKILL
+        unfinished = files.unfinished_change(folder)
+        completed.append(unfinished is not None)
+        if unfinished is not None:
+            assert unfinished == "change"
+            files.finish_change(folder)
+        assert seen(folder) in ((NEW,) if unfinished else (OLD, NEW))
+        assert files.unfinished_change(folder) is None
+    assert (seen(folder), list(folder.glob(".*"))) == (NEW, [])
+    assert completed.count(True) >= 4
+
+
+def renew(folder: Path) -> None:
+    (folder / "b").write_text("new")
+    (folder / "b").replace(folder / "a")
+
+
+def failing_at(file: Path, error: BaseException) -> Callable[[Path, Path], None]:
+    """`Path.replace` that fails if this file is to be replaced."""
+
+    def replace(old: Path, new: Path) -> None:
+        if new == file:
+            raise error
+        os.replace(old, new)
+
+    return replace
+
+
+def test_a_folder_whose_files_cannot_be_replaced_asks_for_a_repeat(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "a").write_text("old")
+    denied = PermissionError(errno.EACCES, os.strerror(errno.EACCES), "hidden")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", failing_at(tmp_path / "a", denied))
+        with pytest.raises(InputError, match=f"^{tmp_path}: .*Permission denied.*repeat the command"):
+            files.change_folder(tmp_path, "change", "a", renew)
+    assert seen(tmp_path) == {"a": "old"}
+    files.finish_change(tmp_path)
+    assert seen(tmp_path) == {"a": "new"}
+
+
+def test_two_changes_of_a_folder_at_once_are_refused(tmp_path: Path) -> None:
+    def change(shown: Path) -> None:
+        with pytest.raises(InputError, match="another process changes this folder"):
+            files.change_folder(tmp_path, "second", "a", renew)
+        renew(shown)
+
+    files.change_folder(tmp_path, "first", "a", change)
+    assert seen(tmp_path) == {"a": "new"}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> tuple[Path, int]:
+    path = copy_square_run(tmp_path / "run")
+    return path, map_info(read_map(path))["accepted_sequences"][-1]["sequence"]
+
+
+def test_a_fault_before_the_last_file_is_made_changes_nothing(run, capsys, monkeypatch) -> None:
+    """A file that is lost or spoilt is one error; Ctrl-C is none."""
+    path, sequence = run
+    whole = content(path)
+    faults = {"steps.csv": None, "online.tum": b"1 2 damaged\n3 4\n", "walls.csv": b"west\nx\n"}
+    for name, spoilt in faults.items():
+        (path / name).unlink(missing_ok=True)
+        if spoilt is not None:
+            (path / name).write_bytes(spoilt)
+        before = content(path)
+        assert refused(capsys, "map", "undo", path, sequence).startswith(str(path / name))
+        assert content(path) == before
+        (path / name).unlink(missing_ok=True)
+        if name in whole:
+            (path / name).write_bytes(whole[name])
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ratslam.runs.map_results.plot_writers", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        undo_sequence(read_map(path), sequence, path / "map.npz")
+    assert content(path) == whole
+
+
+def test_an_undo_that_was_killed_amid_its_files_is_completed_by_a_repeat(run, tmp_path, capsys, monkeypatch):
+    (path, sequence), whole = run, copy_square_run(tmp_path / "whole" / "run")
+    assert main(["map", "undo", str(whole), str(sequence)]) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", failing_at(path / "map.npz", GeneratorExit()))  # no error of a command
+        with pytest.raises(GeneratorExit):
+            main(["map", "undo", str(path), str(sequence)])
+    assert main(["map", "info", str(path)]) == 0
+    assert f"repeat `ratslam map undo {path} {sequence}`" in capsys.readouterr().err
+    assert "is complete" in said(capsys, "map", "undo", path, sequence)
+    assert content(path) == content(whole)

@@ -11,15 +11,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from robot.sources.source import Sample, SourceInfo
+from robot.sources.in_memory import InMemorySource
+from robot.sources.source import Sample
 from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
-from tactile.base.types import Odometry, observation
 
 PLACES, DWELL = 60, 10
 """Places of the circuit, and steps at each: a lap is 600 steps."""
@@ -34,43 +34,42 @@ ALIGNED = 6 * POSE
 SLACK = 24 * 2**20
 """Bytes independent of the steps: allocator, compiled code, file buffers."""
 STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+SETTINGS = {
+    "backend": "classic", "templates": {"source": "labels"},
+    "experience": {"solver": {"name": "relaxation", "loops": 1}},
+}  # fmt: skip
 
 
-class Circuit:
-    """A source of given places that goes round and round, and measures the memory of its process: `peaks` in
-    the first twentieth, the second one, and the rest, bytes."""
+class Circuit(InMemorySource):
+    """Measures the memory of its process: `peaks` in the first twentieth, the second one, and the rest,
+    bytes."""
 
-    name, rate_hz, view_shape, whiskers, digest, info = "circuit", 10.0, (3, 6, 1), 0, "", SourceInfo()
-
-    def __init__(self, steps: int) -> None:
-        self.length = steps
-        self.peaks: list[int] = []
-        lap = PLACES * DWELL
-        random = stream(0, "tests.long_replay")
-        # The same errors on each lap, so that the last lap equals the second.
-        self._motion = np.tile([0.01, 0.0, 2 * np.pi / lap], (lap, 1)) + random.normal(0, 2e-4, (lap, 3))
-        self._truth = integrate(np.tile([0.01, 0.0, 2 * np.pi / lap], (lap, 1)))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
+    peaks: ClassVar[list[int]] = []
 
     def __iter__(self) -> Iterator[Sample]:
-        early, lap = self.length // 10, len(self._motion)
-        for k in range(self.length):
-            if k in (early // 2, early):
-                self._look()
-            moved, place = Odometry(*self._motion[k % lap], 0.1), k % lap // DWELL
-            reading = observation(moved, None, view_shape=self.view_shape, label=place)
-            yield Sample(0.1 * k, reading, self._truth[k % lap])
-        self._look()
+        for k, sample in enumerate(super().__iter__()):
+            if k in (self.length // 20, self.length // 10):
+                self.look()
+            yield sample
+        self.look()
 
-    def _look(self) -> None:
+    def look(self) -> None:
         lines = STATUS.read_text(encoding="ascii").splitlines()
         self.peaks.append(next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM")))
         FORGET.write_text("5", encoding="ascii")
+
+
+def circuit(steps: int) -> Circuit:
+    """Given places, round and round, with the same errors on each lap."""
+    lap = PLACES * DWELL
+    exact = np.tile([0.01, 0.0, 2 * np.pi / lap], (lap, 1))
+    moved = exact + stream(0, "tests.long_replay").normal(0, 2e-4, exact.shape)
+    motion = np.column_stack([np.resize(moved, (steps, 3)), np.full(steps, 0.1)])
+    return Circuit(
+        name="circuit", digest="", time=0.1 * np.arange(steps), motion=motion, moved=np.ones(steps, bool),
+        views=np.broadcast_to(0.0, (steps, 3, 6, 1)), seen=np.zeros(steps, bool),
+        label=np.arange(steps, dtype=np.int32) % lap // DWELL, truth=np.resize(integrate(exact), (steps, 3)),
+    )  # fmt: skip
 
 
 def replay(steps: int, folder: Path) -> dict[str, int]:
@@ -79,28 +78,17 @@ def replay(steps: int, folder: Path) -> dict[str, int]:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from ratslam.methods.method_registry import BACKENDS
-    from ratslam.runs.build_session import build_session
     from ratslam.runs.run import process_source
-    from ratslam.runs.run_directory import RunDirectory
-    from ratslam.runs.runner import Runner
-    from ratslam.runs.settings.run_config import RunConfig
+    from ratslam.runs.runner import open_runner
+    from ratslam.runs.settings.run_config import LoopConfig
 
-    source = Circuit(steps)
-    settings: dict[str, Any] = {
-        "recording": {"file": "circuit.npz"},
-        "backend": "classic",
-        "templates": {"source": "labels"},
-        "experience": {"solver": {"name": "relaxation", "loops": 1}},
-    }
-    config = RunConfig.model_validate(settings)
-    session = build_session(config, source)
-    with RunDirectory(folder, BACKENDS.get(config.backend, "backend").columns()) as store:
-        process_source(Runner(config, source, store, {}, session, 0), source)
-    with (folder / "steps.csv").open(encoding="utf-8") as lines:
-        written = sum(1 for _ in lines) - 1
+    source = circuit(steps)
+    with open_runner(LoopConfig.model_validate(SETTINGS), source, folder) as runner:
+        process_source(runner, source)
+        places = len(runner.session.map.graph())
     _, early, late = source.peaks
-    return {"written": written, "places": len(session.map.graph()), "early": early, "late": late}
+    written = (folder / "steps.csv").read_text(encoding="utf-8").count("\n") - 1
+    return {"written": written, "places": places, "early": early, "late": late}
 
 
 @pytest.mark.parametrize("steps", [10_000, pytest.param(1_000_000, marks=pytest.mark.soak)])
@@ -109,8 +97,7 @@ def test_memory_per_step_is_bounded(steps: int, tmp_path: Path) -> None:
     """In a process of its own, so that only the replay uses memory."""
     if not STATUS.exists() or not FORGET.exists():
         pytest.skip("this system does not tell a process its peak memory")
-    module, folder = "tests.ratslam.core.test_long_replay", str(tmp_path / "run")
-    command = [sys.executable, "-m", module, str(steps), folder]
+    command = [sys.executable, "-m", "tests.ratslam.core.test_long_replay", str(steps), str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])

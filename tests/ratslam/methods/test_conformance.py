@@ -17,17 +17,11 @@ from ratslam.methods.method_registry import BACKENDS
 from ratslam.places.localiser import Localisation
 from ratslam.service.backend_checks import CIRCUIT, BackendTrial
 
-
-def pose_cells(method, source, **more):
-    """A small network."""
-    return method, {"pose_cells": {"cells_xy": 11}, "templates": {"source": source}} | more
-
-
+CELLS = {"pose_cells": {"cells_xy": 11}}
+LABELS, VIEWS = (CELLS | {"templates": {"source": source}} for source in ("labels", "views"))
 # Selects sequences every few frames, so that it does so throughout the session.
-TOUCH = {
-    "recall": {"sector_fov": "whiskers"},
-    "keyframes": {"select_every": 15, "may_be_carried": True, "sequence_agreement": 0.2},
-}
+KEYFRAMES = {"select_every": 15, "may_be_carried": True, "sequence_agreement": 0.2}
+TOUCH = VIEWS | {"recall": {"sector_fov": "whiskers"}, "keyframes": KEYFRAMES}
 SIGNED = TOUCH | {"recall": {"sector_fov": "whiskers", "images": "signed"}}
 # With large odometry noise, so that it resamples throughout the session.
 DOUBTFUL = {
@@ -35,14 +29,14 @@ DOUBTFUL = {
     "likelihood": {"free": 0.5, "contact": 4.0}, "resampling": {"min_effective_share": 0.9},
 }  # fmt: skip
 METHODS = {
-    "recall": pose_cells("recall", "views"),
-    "recall-labels": pose_cells("recall", "labels"),
-    "touch": pose_cells("recall", "views", **TOUCH),
-    "signed-touch": pose_cells("recall", "views", **SIGNED),
-    "classic": pose_cells("classic", "views"),
-    "classic-labels": pose_cells("classic", "labels"),
+    "recall": ("recall", VIEWS),
+    "recall-labels": ("recall", LABELS),
+    "touch": ("recall", TOUCH),
+    "signed-touch": ("recall", SIGNED),
+    "classic": ("classic", VIEWS),
+    "classic-labels": ("classic", LABELS),
     "grid": ("grid", {"grid": DOUBTFUL}),
-    "localise": pose_cells("localise", "views", **TOUCH),
+    "localise": ("localise", TOUCH),
     "localise_grid": ("localise_grid", {"grid": DOUBTFUL}),
 }
 EXAMPLE = "dead-reckoning"
@@ -52,7 +46,6 @@ OFTEN = {"recall", "recall-labels", "classic", "classic-labels", "signed-touch",
 
 
 def some(names, seldom=OFTEN):
-    """The names as parameters, the seldom ones for the soak."""
     return [pytest.param(name, marks=pytest.mark.soak) if name in seldom else name for name in names]
 
 
@@ -64,8 +57,7 @@ def trial_of(name):
     if name == "localise":
         settings = settings | {"localise": {"map": str(map_of("touch")), "log_odds": 3.0}}
     if name == "localise_grid":
-        file = str(map_of("grid"))
-        settings = settings | {"localise": {"map": file, "log_odds": 0.5, "particles": 300}}
+        settings = settings | {"localise": {"map": str(map_of("grid")), "log_odds": 0.5, "particles": 300}}
     entry = BACKENDS.get(method, "backend")
     return BackendTrial(entry, entry.config_class.model_validate(settings))
 
@@ -85,7 +77,6 @@ SELDOM = {"a batch equals its members": {EXAMPLE}, "single precision stays singl
 
 
 def cases():
-    """Every backend with every check; the rare ones, and those of the backends in `OFTEN`, for the soak."""
     for name in [*METHODS, EXAMPLE]:
         for check in BackendTrial.checks():
             rare = name not in SELDOM.get(check.name, {name})
@@ -100,12 +91,11 @@ def test_our_backends_pass(name, check):
 
 @pytest.mark.parametrize("name", some(METHODS, METHODS.keys() - {"grid"}))
 def test_the_evidence_is_finite_in_single_precision(name):
-    _, steps = trial_of(name).single
-    for step in steps:
-        # Undefined until a place is recognised.
-        known = [name for name in step.evidence._fields if name not in ("background", "error")]
-        for value in (np.asarray(getattr(step.evidence, name)) for name in known):
-            assert value.dtype.kind != "f" or np.isfinite(value).all()
+    for step in trial_of(name).single[1]:
+        for each in step.evidence._fields:
+            value = np.asarray(getattr(step.evidence, each))
+            # Two are undefined until a place is recognised.
+            assert each in ("background", "error") or value.dtype.kind != "f" or np.isfinite(value).all()
 
 
 def outcomes(name):
@@ -134,15 +124,12 @@ FIXED = ["classic", "classic-labels", "grid", "localise", "localise_grid", EXAMP
 
 @pytest.mark.parametrize("name", some(FIXED))
 def test_memory_does_not_grow_on_known_ground(name):
-    """Otherwise time and memory of long sessions on known ground would grow."""
-    trial = trial_of(name)
-    session = trial.fresh()
-    list(session.replay(trial.walk(600)))
+    session = trial_of(name).fresh()
+    list(session.replay(trial_of(name).walk(600)))
     assert session.compilations() == 1
 
 
 def test_capacity_depends_on_the_chunk_alone():
-    assert {capacity_at(step) for step in range(256)} == {256}
-    assert capacity_at(256) == 512
+    assert ({capacity_at(step) for step in range(256)}, capacity_at(256)) == ({256}, 512)
     assert len({capacity_at(step) for step in range(CHUNK * 4, CHUNK * 5)}) == 1
     assert capacity_at(0, 1000) == 1024

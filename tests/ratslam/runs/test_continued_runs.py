@@ -6,7 +6,7 @@ import json
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,6 @@ from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.source import Sample
-from tactile.base.errors import InputError
 
 TRACE = Path(__file__).parents[2] / "golden" / "a_square3.npz"
 METHOD = {
@@ -38,7 +37,7 @@ FIRST, SECOND = 60, 100
 
 
 class Killed(Exception):
-    """The end of a process, without results."""
+    pass
 
 
 def interrupt() -> None:
@@ -51,8 +50,6 @@ def kill() -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stopping(InMemorySource):
-    """A recording at one of whose samples something happens."""
-
     number: int = -1
     happens: Callable[[], None] = interrupt
 
@@ -64,23 +61,17 @@ class Stopping(InMemorySource):
 
 
 def part(name: str, rows: slice) -> InMemorySource:
-    """Rows of the square as a recording of their own."""
     with open_recording(RecordingConfig(file=TRACE)) as whole:
         assert isinstance(whole, InMemorySource)
         names = ("time", "motion", "moved", "views", "seen", "label", "truth")
         return replace(whole, name=name, digest=name, **{each: getattr(whole, each)[rows] for each in names})
 
 
-def first() -> InMemorySource:
-    return part("monday", slice(FIRST))
-
-
-def second() -> InMemorySource:
-    return part("tuesday", slice(FIRST, FIRST + SECOND))
+first = partial(part, "monday", slice(FIRST))
+second = partial(part, "tuesday", slice(FIRST, FIRST + SECOND))
 
 
 def stopping(number: int, happens: Callable[[], None]) -> Stopping:
-    """The second recording, at one of whose samples something happens."""
     return Stopping(**vars(second()), number=number, happens=happens)
 
 
@@ -106,7 +97,6 @@ def monday(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def expected(monday: Path) -> SavedMap:
-    """The map of both recordings, without an interruption."""
     return run(second(), monday.with_name("whole"), monday)
 
 
@@ -133,8 +123,7 @@ def test_warnings_about_the_input_go_with_the_map(tmp_path: Path, monkeypatch: p
 
 
 def assert_same(found: SavedMap, expected: SavedMap) -> None:
-    assert found.steps == FIRST + SECOND
-    assert found.arrays.keys() == expected.arrays.keys()
+    assert (found.steps, found.arrays.keys()) == (FIRST + SECOND, expected.arrays.keys())
     for name, array in expected.arrays.items():
         np.testing.assert_array_equal(found.arrays[name], array, err_msg=name)
     assert found.digest == expected.digest
@@ -160,11 +149,6 @@ def test_a_killed_run_goes_on_from_its_checkpoint(monday, expected, tmp_path, mo
     assert_same(run(second(), tmp_path / "rest", tmp_path / "killed"), expected)
 
 
-def test_a_recording_that_is_mapped_whole_is_refused(expected: SavedMap, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"already holds all {SECOND} samples of tuesday"):
-        run(second(), tmp_path / "again", expected.path)
-
-
 def of_first_format(file: Path, path: Path) -> Path:
     """A copy of a map file in the format that does not tell which steps are of the last recording."""
     with np.load(file) as archive:
@@ -183,9 +167,11 @@ def test_a_map_in_the_first_format_goes_on_if_it_tells_its_samples(expected, tmp
     np.testing.assert_array_equal(*(map.trajectory() for map in maps))
     old = of_first_format(expected.path, tmp_path / "old.npz")
     message = r"old\.npz: 160 steps of several recordings.*continue the map that this one went on from"
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(ratslam.InputError, match=message):
         run(second(), tmp_path / "refused", old)
     assert run(part("wednesday", slice(160, 170)), tmp_path / "other", old).samples_of("wednesday") == 10
+    with pytest.raises(ratslam.InputError, match=f"already holds all {SECOND} samples of tuesday"):
+        run(second(), tmp_path / "again", expected.path)
 
 
 def test_a_map_of_one_piece_takes_no_other_recording_and_no_other_method(monday, tmp_path):
@@ -195,11 +181,11 @@ def test_a_map_of_one_piece_takes_no_other_recording_and_no_other_method(monday,
     assert resume_session(session, tmp_path, config, first())[0] == 0
     for recording in ("tuesday", ""):
         other = replace(second(), name=recording or "loop", digest=recording)
-        message = (
-            rf"map\.npz: a map of `backend: classic`, which is one piece; {other.name} is not the recording"
-        )
-        with pytest.raises(InputError, match=f"{message}.*by itself, or map both with"):
+        message = rf"map\.npz: a map of `backend: classic`, which is one piece; {other.name} is not the "
+        with pytest.raises(ratslam.InputError, match=f"{message}recording.*by itself, or map both with"):
             resume_session(session, tmp_path, config, other)
         assert session.steps == session.earlier == 0
-    with pytest.raises(InputError, match=r"backend is classic and was recall.*`--set backend=recall`"):
+    with pytest.raises(
+        ratslam.InputError, match=r"backend is classic and was recall.*`--set backend=recall`"
+    ):
         resume_session(session, monday, config, second())

@@ -23,8 +23,7 @@ def test_a_map_of_any_format_goes_on(file: Path) -> None:
     """`tests/data/maps/make_map.py` makes the file of the present one."""
     assert FORMAT in {one.stem for one in FILES}
     assert file.stat().st_size < LARGEST
-    expected = np.loadtxt(file.with_suffix(".csv"), delimiter=",")
-    saved = read_map(file)
+    expected, saved = np.loadtxt(file.with_suffix(".csv"), delimiter=","), read_map(file)
     engine = "window" if file == FILES[-1] else "dense"  # moved since the first
     assert (saved.config.pose_cells.cells_xy, saved.config.attractor.engine) == (11, engine)
     assert saved.sensor.describe() == "whisker head, 18 whiskers; views of 3 x 6 x 1, values in 0..1"

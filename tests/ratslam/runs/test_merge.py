@@ -1,4 +1,4 @@
-"""Saved maps merged into one: what joins, what stays apart, maps of the same session; killed merges."""
+"""Saved maps merged into one; killed merges; maps of a building whose places have given ids."""
 
 from __future__ import annotations
 
@@ -9,114 +9,86 @@ from dataclasses import replace
 from functools import cache, partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 import ratslam
+from evaluation.metrics.trajectory import align, ate
 from ratslam.cli import main
-from ratslam.core.session import Session
+from ratslam.core.estimates import Localisation
 from ratslam.places.crop import keyframes_of_steps
 from ratslam.runs import merge as merging
 from ratslam.runs.map_care import crop_saved, undo_sequence
-from ratslam.runs.map_settings import differing_settings
 from ratslam.runs.merge import check_mergeable, describe_merge, merge_maps
 from ratslam.runs.saved_map import describe_readings, read_map, write_map
 from ratslam.runs.settings.completion import complete
+from ratslam.runs.settings.run_config import LoopConfig
+from ratslam.runs.slam import Slam
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.simulated_session import HeadSimulation
+from robot.sources.source import SourceDescription
 from robot.touch_source import open_touch_source
-from tactile.base.errors import InputError
-from tactile.base.se2 import between
+from tactile.base.se2 import between, compose, integrate
+from tactile.base.types import Observation, Odometry, observation
+from tests.ratslam.runs import touch_walks as walks
 from tests.ratslam.runs.test_map_formats import FILES
-from tests.ratslam.runs.touch_walks import (
-    LAPS,
-    SMALL,
-    Walk,
-    config_of,
-    dead_reckoning,
-    empty_session,
-    follow,
-    metric,
-    simulate_walk,
-)
 
 READINGS = Path(__file__).parents[2] / "golden" / "touch_circuits.mcap"
 WHOLE = FILES[-1]
 
 
 MAZES = {1: 31001, 2: 31001, 3: 31002}
-"""The maze of each session, by its seed."""
-
-
-def session_in(seed: int) -> dict[str, Any]:
-    return {"seed": seed} | LAPS | {"maze": SMALL | {"seed": MAZES[seed]}}
+SESSIONS = {
+    seed: {"seed": seed} | walks.LAPS | {"maze": walks.SMALL | {"seed": maze}} for seed, maze in MAZES.items()
+}
 
 
 @cache
-def walk_of(seed: int) -> Walk:
-    return simulate_walk(**session_in(seed))
+def walk_of(seed: int) -> walks.Walk:
+    return walks.simulate_walk(**SESSIONS[seed])
 
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
-    """The map of each session."""
     folder = tmp_path_factory.mktemp("maps")
-    for seed in MAZES:
-        config = config_of(simulation=session_in(seed))
+    for seed, simulation in SESSIONS.items():
+        config = walks.config_of(simulation=simulation)
         assert config.simulation is not None
         source = HeadSimulation(config.simulation)
-        config, session = complete(config, source), empty_session()
-        follow(session, walk_of(seed).readings)
+        config, session = complete(config, source), walks.empty_session()
+        walks.follow(session, walk_of(seed).readings)
         described = describe_readings(open_touch_source(source, config.touch))
         write_map(folder / f"{seed}.npz", session, config, described)
-    return {seed: folder / f"{seed}.npz" for seed in MAZES}
-
-
-@pytest.fixture(scope="module")
-def joined(maps: dict[int, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("joined") / "both.npz"
-    merge_maps([maps[1], maps[2]], path)
-    return path
+    return {seed: folder / f"{seed}.npz" for seed in SESSIONS}
 
 
 def map_in(path: Path) -> Any:
     return read_map(path).open_session().map
 
 
-def test_two_sessions_of_a_maze_become_one_map(maps: dict[int, Path], joined: Path) -> None:
+def test_two_sessions_become_one_map_that_goes_on_as_any_other(maps: dict[int, Path], tmp_path) -> None:
+    joined = tmp_path / "both.npz"
+    merge_maps([maps[1], maps[2]], joined)
     made, kept = map_in(joined), [map_in(maps[seed]).state.count for seed in (1, 2)]
     order = sorted((1, 2), key=lambda seed: read_map(maps[seed]).digest)
     truth = np.concatenate([walk_of(seed).truth for seed in order])
     assert not made.pieces().any()
-    union = metric(made.map_trajectory(), truth)
-    alone = metric(map_in(maps[1]).map_trajectory(), walk_of(1).truth)
-    odometry = np.concatenate([dead_reckoning(walk_of(seed).readings) for seed in order])
-    assert union < 1.5 * alone + 0.02 < metric(odometry, truth)
+    union = walks.metric(made.map_trajectory(), truth)
+    alone = walks.metric(map_in(maps[1]).map_trajectory(), walk_of(1).truth)
+    odometry = np.concatenate([walks.dead_reckoning(walk_of(seed).readings) for seed in order])
+    assert union < 1.5 * alone + 0.02 < walks.metric(odometry, truth)
     assert made.state.count < 0.7 * sum(kept)
-
-
-@pytest.mark.soak
-def test_the_order_of_arguments_does_not_matter(maps: dict[int, Path], joined: Path, tmp_path: Path) -> None:
-    merge_maps([maps[2], maps[1]], tmp_path / "both.npz")
-    assert read_map(tmp_path / "both.npz").digest == read_map(joined).digest
-
-
-def test_a_merged_map_goes_on_as_any_other(joined: Path) -> None:
-    readings, saved = walk_of(1).readings[:40], read_map(joined)
-
-    def begin() -> Session:
-        session = empty_session()
+    readings, saved, session = walk_of(1).readings[:40], read_map(joined), walks.empty_session()
+    results = []
+    for play in (session.replay, partial(map, session.step)):
         saved.restore(session, saved.config)
         session.begin_piece()
-        return session
-
-    session = begin()
-    live = [session.step(reading).pose for reading in readings]
-    assert len(session.map.trajectory()) == session.steps == saved.steps + len(readings)
-    assert np.array_equal(live, [step.pose for step in begin().replay(readings)])
+        results.append([step.pose for step in play(readings)])
+        assert len(session.map.trajectory()) == session.steps == saved.steps + len(readings)
+    assert np.array_equal(*results)
 
 
 def test_what_nothing_joins_stays_a_piece(maps: dict[int, Path], tmp_path: Path, capsys) -> None:
@@ -126,8 +98,7 @@ def test_what_nothing_joins_stays_a_piece(maps: dict[int, Path], tmp_path: Path,
     made = map_in(target)
     piece, path = made.pieces(), made.trajectory()
     assert np.loadtxt(target / "pieces.csv", delimiter=",", skiprows=1)[:, 1].tolist() == piece.tolist()
-    assert {one.name for one in target.iterdir()} >= {"map.npz", "map.png", "trajectory.tum", "map.json"}
-    assert (target / "merge.json").exists()
+    assert {one.name for one in target.iterdir()} >= {"map.npz", "map.png", "trajectory.tum", "merge.json"}
     page, bag = str(tmp_path / "page.html"), str(tmp_path / "both.mcap")
     for command in (["score"], ["report", "-o", page], ["export", "-o", bag]):
         assert main([*command, str(target)]) == 2
@@ -145,7 +116,6 @@ def test_what_nothing_joins_stays_a_piece(maps: dict[int, Path], tmp_path: Path,
 
 
 def part(path: Path, first: int, last: int) -> Path:
-    """The steps of a map from `first` to `last` - 1."""
     crop_saved(read_map(WHOLE), partial(keyframes_of_steps, first=first, last=last), path)
     return path
 
@@ -162,11 +132,10 @@ def quick_merge(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(merging, "join_all", lambda *_: [])
 
 
-def test_a_map_is_not_merged_with_itself(halves: list[Path], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="the same map as"):
-        merge_maps([halves[0], halves[0]], tmp_path / "both.npz")
-    with pytest.raises(InputError, match="two or more maps"):
-        merge_maps([halves[0]], tmp_path / "both.npz")
+def test_a_map_is_not_merged_with_itself_or_alone(halves: list[Path], tmp_path: Path) -> None:
+    for maps, message in (([halves[0]] * 2, "the same map as"), ([halves[0]], "two or more maps")):
+        with pytest.raises(ratslam.InputError, match=message):
+            merge_maps(maps, tmp_path / "both.npz")
     assert not list(tmp_path.iterdir())
 
 
@@ -178,7 +147,6 @@ def refused(capsys: pytest.CaptureFixture[str], target: Path, *maps: Path) -> st
 
 
 def test_a_session_that_two_maps_hold_is_not_merged(halves, capsys, tmp_path: Path, quick_merge) -> None:
-    """A part, merged, continued and corrected maps."""
     both, longer, undone = (tmp_path / f"{name}.npz" for name in ("both", "longer", "undone"))
     merge_maps(halves, both)
     slam = ratslam.Slam.load(halves[0])
@@ -198,7 +166,6 @@ def test_a_session_that_two_maps_hold_is_not_merged(halves, capsys, tmp_path: Pa
 
 
 def test_common_steps_can_be_cut_out(halves, capsys, tmp_path: Path, quick_merge) -> None:
-    """The command that the error gives does so."""
     late = part(tmp_path / "late.npz", 120, 300)
     error = refused(capsys, tmp_path / "both", halves[0], late)
     command = error.split("`ratslam ")[1].removesuffix("`").split()
@@ -208,26 +175,22 @@ def test_common_steps_can_be_cut_out(halves, capsys, tmp_path: Path, quick_merge
     assert merge_maps([rest, other], tmp_path / "both.npz")["steps"]
 
 
-def test_a_recording_is_mapped_once_whatever_the_settings(halves) -> None:
+def test_a_recording_is_mapped_once_and_by_one_sensor(halves) -> None:
     one, two = (replace(read_map(half), recording="ab") for half in halves)
-    with pytest.raises(InputError, match=r"two.npz: .* the same recording .* as that of .*one.npz"):
+    with pytest.raises(ratslam.InputError, match=r"two.npz: .* the same recording .* as that of .*one.npz"):
         check_mergeable([one, two])
-    check_mergeable([one, replace(two, recording="cd")])
-
-
-def test_of_two_sensors_both_maps_are_named(halves) -> None:
-    one, two = (read_map(half) for half in halves)
+    two = replace(two, recording="cd")
+    check_mergeable([one, two])
     cells = two.config.pose_cells.model_copy(update={"cell_size": 7.0})
     other = replace(two, config=two.config.model_copy(update={"pose_cells": cells}))
     size = one.config.pose_cells.cell_size
-    with pytest.raises(InputError, match=r"two.npz: made with other settings of") as caught:
+    found = rf"two.npz: made with other settings of .*pose_cells.cell_size is 7.0 here and {size} there"
+    with pytest.raises(ratslam.InputError, match=found) as caught:
         check_mergeable([one, other])
-    assert f"pose_cells.cell_size is 7.0 here and {size} there" in str(caught.value)
     assert f"config.yaml --set pose_cells.cell_size={size} -o" in caught.value.cure
 
 
-def test_settings_that_differ_are_told(halves, tmp_path: Path, quick_merge) -> None:
-    """With the values of each map; the merged map has those that the report says."""
+def test_settings_that_differ_are_told_and_the_merged_map_has_those_told(halves, tmp_path, quick_merge):
     saved = read_map(halves[1])
     keyframes = saved.config.keyframes.model_copy(update={"min_score": 77.0})
     config = saved.config.model_copy(update={"keyframes": keyframes})
@@ -236,20 +199,10 @@ def test_settings_that_differ_are_told(halves, tmp_path: Path, quick_merge) -> N
     ((name, values),) = report["settings"].items()
     assert (name, sorted(values)) == ("keyframes.min_score", [saved.config.keyframes.min_score, 77.0])
     assert read_map(tmp_path / "both.npz").config.keyframes.min_score == values[0]
-    heading, line = describe_merge(report).splitlines()[-2:]
-    assert report["maps"][0] in heading
-    assert line == f"keyframes.min_score {values[0]} (map 2: {values[1]})"
+    assert describe_merge(report).splitlines()[-1] == f"keyframes.min_score {values[0]} (map 2: {values[1]})"
     assert merge_maps(halves, tmp_path / "alike.npz")["settings"] == {}
-
-
-def test_what_is_no_setting_of_the_method_may_differ() -> None:
-    config = read_map(WHOLE).config
-    session = config.session.model_copy(update={"seed": 5, "reserve": 64})
-    assert differing_settings([config, config.model_copy(update={"session": session, "cells": None})]) == {}
-    session = config.session.model_copy(update={"precision": "float32"})
-    other = config.model_copy(update={"session": session})
-    found = differing_settings([config, config, other])
-    assert found == {"session.precision": ["float64", "float64", "float32"]}
+    merge_maps(halves[::-1], tmp_path / "turned.npz")  # the order does not matter
+    assert read_map(tmp_path / "turned.npz").digest == read_map(tmp_path / "alike.npz").digest
 
 
 @pytest.mark.parametrize("name", ["both.npz", "both"])
@@ -306,8 +259,7 @@ def check_kill(moment: int, output: Path, halves: list[Path]) -> bool:
         assert not output.exists()
         assert all(path.name.startswith(".") for path in output.parent.iterdir())
     else:
-        assert list(output.parent.iterdir()) == [output]
-        assert read_map(output).steps == 360
+        assert (list(output.parent.iterdir()), read_map(output).steps) == ([output], 360)
     return killed
 
 
@@ -321,8 +273,7 @@ def test_a_killed_merge_leaves_the_maps_and_no_half_map(name, moment, halves, tm
     left = {path.name for path in output.parent.iterdir()}
     assert left
     merge_maps(halves, output)
-    assert read_map(output).steps == 360
-    assert {path.name for path in output.parent.iterdir()} == left | {name}
+    assert (read_map(output).steps, {path.name for path in output.parent.iterdir()}) == (360, left | {name})
 
 
 @pytest.mark.soak
@@ -332,3 +283,96 @@ def test_a_merge_may_be_killed_at_every_moment(name: str, halves: list[Path], tm
     while check_kill(moment, tmp_path / str(moment) / name, halves):
         moment += 1
     assert moment >= 3
+
+
+SIDES = (16.0, 12.0)
+STEP, MARKED = 0.25, 8
+"""Motion of a step, m; steps between two places with an id."""
+UNCERTAIN = 0.9
+"""Largest standard deviation of the position of a robot that is found, m."""
+SETTINGS = {
+    "templates": {"source": "labels"},
+    "pose_cells": {"cells_xy": 11, "cell_size": 0.5},
+    "attractor": {"engine": "dense"},
+    "session": {"reserve": 128},
+}
+
+
+class Drive(NamedTuple):
+    readings: list[Observation]
+    truth: np.ndarray
+
+
+def lap() -> np.ndarray:
+    """[n, 3] motions once round the rectangle."""
+    sides = [np.tile([STEP, 0.0, 0.0], (round(length / STEP), 1)) for length in SIDES * 2]
+    for side in sides:
+        side[-1, 2] = np.pi / 2
+    return np.concatenate(sides)
+
+
+def drive(begin: int, steps: int, seed: int, first_id: int = 0, order: int = 1) -> Drive:
+    """A drive that begins at a step of the lap; markers have consecutive ids, but for an order."""
+    motion = np.roll(lap(), -begin, axis=0)[np.arange(steps) % len(lap())]
+    truth = compose(integrate(lap())[begin], integrate(motion))
+    noise = np.random.default_rng(seed).normal(0, [0.01, 0.002, 0.01], (steps, 3))
+    at = (begin + 1 + np.arange(steps)) % len(lap())
+    given = first_id + order * (at // MARKED) % (len(lap()) // MARKED)
+    label = np.where(at % MARKED == 0, given, -1)
+    readings = [
+        observation(Odometry(*moved, 0.25), view_shape=(1, 1, 1), label=int(one))
+        for moved, one in zip(motion + noise, label, strict=True)
+    ]
+    return Drive(readings, truth)
+
+
+def mapped(path: Path, made: Drive) -> Path:
+    slam = Slam(LoopConfig.model_validate(SETTINGS), SourceDescription(view_shape=(1, 1, 1), rate_hz=4.0))
+    for reading in made.readings:
+        slam.step(reading)
+    slam.save(path)
+    return path
+
+
+FIRST = drive(0, 450, 1)
+
+
+@pytest.fixture(scope="module")
+def map_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return mapped(tmp_path_factory.mktemp("ids") / "first.npz", FIRST)
+
+
+def states(map_file: Path, session: Drive) -> tuple[np.ndarray, np.ndarray]:
+    """[N] the state at each step, and the largest error of the poses where the robot is found, m."""
+    slam = Slam.load(map_file, mode="localise")
+    poses = np.array([slam.step(reading).pose for reading in session.readings])
+    state = np.asarray(slam.map.states())
+    frame = align(read_map(map_file).open_session().map.trajectory(), FIRST.truth)
+    apart = np.hypot(*(compose(frame, poses) - session.truth)[:, :2].T)
+    return state, apart[state == Localisation.FOUND].max(initial=0)
+
+
+def test_a_robot_is_found_by_a_few_ids_and_stays_found(map_file: Path) -> None:
+    state, error = states(map_file, drive(100, 150, 2))
+    found = state == Localisation.FOUND
+    assert 0 < np.argmax(found) <= 6 * MARKED
+    assert found[np.argmax(found) :].all()
+    assert error < UNCERTAIN
+
+
+@pytest.mark.parametrize(("first_id", "order"), [(1000, 1), (0, 11)], ids=["other ids", "the same elsewhere"])
+def test_in_another_building_it_is_never_found(first_id: int, order: int, map_file: Path) -> None:
+    state, _ = states(map_file, drive(100, 300, 8, first_id, order))
+    assert not (state == Localisation.FOUND).any()
+    assert (state[-1] == Localisation.NOT_THIS_MAP) == (order > 1)
+
+
+def test_sessions_that_saw_the_same_ids_become_one_map(map_file: Path, tmp_path: Path) -> None:
+    again, other = drive(60, 300, 5), drive(0, 300, 6, first_id=1000)
+    report = merge_maps([map_file, mapped(tmp_path / "again.npz", again)], tmp_path / "joined.npz")
+    assert len(report["pieces"]) == 1
+    order = [FIRST if path == str(map_file) else again for path in report["maps"]]
+    path = read_map(tmp_path / "joined.npz").open_session().map.trajectory()
+    assert ate(path, np.concatenate([one.truth for one in order])) < 0.5
+    apart = merge_maps([map_file, mapped(tmp_path / "other.npz", other)], tmp_path / "apart.npz")
+    assert len(apart["pieces"]) == 2

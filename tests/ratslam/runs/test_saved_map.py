@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -28,7 +29,6 @@ from ratslam.runs.settings.run_config import LoopConfig, RunConfig
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.source import SourceDescription
-from tactile.base.errors import InputError
 
 TESTS = Path(__file__).parents[2]
 FILE = TESTS / "data" / "maps" / f"{FORMAT}.npz"
@@ -46,7 +46,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> ratslam.Result:
 
 @pytest.fixture(scope="module")
 def session(run: ratslam.Result) -> Session:
-    """A session with the configuration of the run."""
     return read_map(run.directory).open_session()
 
 
@@ -71,13 +70,16 @@ def rewritten(
     return path
 
 
-def test_a_run_directory_and_its_file_are_the_same_map(run: ratslam.Result, session: Session) -> None:
+def test_a_run_directory_its_file_and_one_written_anew_are_the_same_map(run, session, tmp_path) -> None:
     saved, same = read_map(run.directory), read_map(run.directory / "map.npz")
     assert saved.digest == same.digest == digest_of(np.load(run.directory / "map.npz"))
     assert (saved.format, saved.steps) == (FORMAT, len(run.time))
     assert saved.sensor.kind == "camera or laser"
     np.testing.assert_array_equal(session.map.online_trajectory()[-1], saved.estimate.pose)
     assert np.abs(session.map.trajectory() - run.trajectory).max() < 1e-12  # quaternions in files round
+    given = {"recording": saved.recording, "estimate": saved.estimate}
+    write_map(tmp_path / "map.npz", session, saved.config, saved.source, **given)
+    assert (tmp_path / "map.npz").read_bytes() == (run.directory / "map.npz").read_bytes()
 
 
 def test_a_loop_goes_on_from_a_run_and_a_run_from_a_loop(run: ratslam.Result, tmp_path: Path) -> None:
@@ -94,79 +96,66 @@ def test_a_loop_goes_on_from_a_run_and_a_run_from_a_loop(run: ratslam.Result, tm
     assert read_map(second.directory).steps == 2 * before.steps
 
 
-def test_written_maps_are_equal_to_the_bit(run: ratslam.Result, session: Session, tmp_path: Path) -> None:
-    saved = read_map(run.directory)
-    write_map(
-        tmp_path / "map.npz", session, saved.config, saved.source,
-        recording=saved.recording, estimate=saved.estimate,
-    )  # fmt: skip
-    assert (tmp_path / "map.npz").read_bytes() == (run.directory / "map.npz").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"format": "ratslam-map-9"}, "format 'ratslam-map-9'.*ratslam-map-1 or .* or ratslam-map-3"),
-        ({"format": 3}, "map format '3'"),
-        ({"config": "backend: nemo\n"}, "backend: 'nemo'; expected a backend"),
-        ({"config": "recall: {guard: many}\n"}, "config:1:"),
-        ({"source": "{}"}, "not a description of a source"),
-        ({"steps": -4}, "-4 steps"),
-        ({"earlier": -2}, "-2 steps of earlier recordings"),
-        ({"earlier": 10_000}, "10000 steps of earlier recordings among"),
-        ({"drop": ("earlier",)}, "without 'earlier'"),
-        ({"estimate__pose": np.zeros(2)}, "pose of the estimate: float64 of shape"),
-        ({"recording": 7}, "'recording' is not a text"),
-        ({"drop": ("config",)}, "a file without 'config'"),
-        ({"drop": ("format",)}, "a file without 'format'"),
-        ({"drop": ("steps",)}, "an archive of other arrays"),
-        ({"drop": ("estimate/place",)}, "without 'place'"),
-        ({"sign": False, "steps": 4}, "damaged: the content does not match its sha256"),
-    ],
-)
-def test_broken_files_are_refused(run: ratslam.Result, tmp_path: Path, changes: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_map(rewritten(run.directory / "map.npz", tmp_path / "map.npz", **changes))
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"format": "ratslam-map-9"}, "format 'ratslam-map-9'.*ratslam-map-1 or .* or ratslam-map-3"),
+    ({"format": 3}, "map format '3'"),
+    ({"config": "backend: nemo\n"}, "backend: 'nemo'; expected a backend"),
+    ({"config": "recall: {guard: many}\n"}, "config:1:"),
+    ({"source": "{}"}, "not a description of a source"),
+    ({"steps": -4}, "-4 steps"),
+    ({"earlier": -2}, "-2 steps of earlier recordings"),
+    ({"earlier": 10_000}, "10000 steps of earlier recordings among"),
+    ({"drop": ("earlier",)}, "without 'earlier'"),
+    ({"estimate__pose": np.zeros(2)}, "pose of the estimate: float64 of shape"),
+    ({"recording": 7}, "'recording' is not a text"),
+    ({"drop": ("config",)}, "a file without 'config'"),
+    ({"drop": ("format",)}, "a file without 'format'"),
+    ({"drop": ("steps",)}, "an archive of other arrays"),
+    ({"drop": ("estimate/place",)}, "without 'place'"),
+    ({"sign": False, "steps": 4}, "damaged: the content does not match its sha256"),
+    ({"drop": ("map/graph/pose",)}, "without 'pose'"),
+    ({"drop": ("state/3",)}, "another configuration or view shape"),
+    ({"map__graph__pose": np.zeros((3, 2))}, "could not broadcast"),
+    ({"map__graph__pose": np.zeros((3, 3), np.float32)}, "map/graph/pose of dtype float32"),
+    ({"map__graph__more": np.zeros(3)}, "the unknown array map/graph/more"),
+])  # fmt: skip
+def test_broken_files_are_refused(run, session, tmp_path: Path, changes: dict, message: str) -> None:
+    path = rewritten(run.directory / "map.npz", tmp_path / "map.npz", **changes)
+    with pytest.raises(ratslam.InputError, match=message):
+        (saved := read_map(path)).restore(session, saved.config)
 
 
 def refusal(path: Path) -> str:
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(ratslam.InputError) as caught:
         read_map(path)
     said = str(caught.value)
     assert said.startswith(f"{path}: ")
     return said.removeprefix(f"{path}: ")
 
 
-def test_a_damaged_map_is_told_from_another_file(tmp_path: Path) -> None:
+def test_damaged_maps_are_told_from_others_and_those_that_cannot_be_opened(tmp_path, monkeypatch) -> None:
     path, whole = tmp_path / "map.npz", FILE.read_bytes()
     middle = len(whole) // 2
     for content in (whole[:middle], whole[:-1], whole[:middle] + bytes(8) + whole[middle + 8 :]):
         path.write_bytes(content)
-        said = refusal(path)
-        assert said.startswith("damaged")
-        assert "restore it from a copy" in said
-    path.write_bytes(b"t,x,y\n")
-    assert refusal(path).startswith("not a map; expected a map")
-    path.write_bytes(b"")
-    assert refusal(path).startswith("empty")
-
-
-def test_a_map_that_cannot_be_opened_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        assert re.match("damaged.*restore it from a copy", refusal(path))
+    for content, what in ((b"t,x,y\n", "not a map; expected a map"), (b"", "empty")):
+        path.write_bytes(content)
+        assert refusal(path).startswith(what)
+    path.unlink()
     os.mkfifo(tmp_path / "pipe.npz")
     assert refusal(tmp_path / "pipe.npz").startswith("neither a file nor a folder; expected a map")
     assert refusal(FILE / "map.npz").startswith("cannot be read (Not a directory); ")
-    with pytest.raises(InputError, match=r"map\.npz: no such file; expected a map"):
+    with pytest.raises(ratslam.InputError, match=r"map\.npz: no such file; expected a map"):
         read_map(tmp_path)
-    with pytest.raises(InputError, match=f"^{tmp_path / 'map.npz'}: no such file; expected the map in which"):
+    with pytest.raises(ratslam.InputError, match=f"^{path}: no such file; expected the map in which"):
         restore_map(LocaliseConfig(map=tmp_path), PathMap(), "recall")
 
     def deny(path: Path, *_: object, **__: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
     monkeypatch.setattr(Path, "open", deny)
-    said = refusal(FILE)
-    assert said.startswith("cannot be read (Permission denied); ")
-    assert "permissions" in said
+    assert re.match(r"cannot be read \(Permission denied\); .*permissions", refusal(FILE))
 
 
 @pytest.mark.soak
@@ -180,19 +169,18 @@ def test_a_localised_session_names_its_map_that_was_changed_or_moved(tmp_path: P
     assert map_info(read_map(session))["steps"] == 5
     saved = read_map(place)
     undo_sequence(saved, map_info(saved)["accepted_sequences"][0]["sequence"], place)
-    with pytest.raises(InputError, match=f"expected {place} as it was when this session was localised"):
+    with pytest.raises(ratslam.InputError, match=f"expected {place} as it was when this .* localised"):
         read_map(session).open_session()
     place.unlink()
-    with pytest.raises(InputError, match=f"{place}: no such file; expected the map in which"):
+    with pytest.raises(ratslam.InputError, match=f"{place}: no such file; expected the map in which"):
         read_map(session).open_session()
 
 
 def test_a_map_in_the_place_of_a_recording_is_one_error(tmp_path: Path) -> None:
     shutil.copy(FILE, tmp_path / "map.npz")
     for path in (FILE, tmp_path):
-        with pytest.raises(InputError, match="a map, which is no recording") as caught:
+        with pytest.raises(ratslam.InputError, match="a map, which is no recording"):
             recorded_alike(path, read_map(FILE))
-        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("backend", ["localise_grid", "classic", *LOCALISING])
@@ -203,60 +191,39 @@ def test_a_robot_is_found_in_maps_of_some_methods_and_others_are_refused_with_th
         assert localising(saved.config, saved).backend == LOCALISING[backend]
         return
     reason = {"localise_grid": "a session in another map", "classic": "classic"}[backend]
-    with pytest.raises(InputError, match=reason) as error:
+    with pytest.raises(ratslam.InputError, match=reason) as error:
         localising(saved.config, saved)
     assert "map the place again with `backend: recall`" in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"view_shape": (1, 36, 1)}, r"the shape of the views is \(1, 36, 1\) and was \(3, 6, 1\)"),
-        ({"unit": "signed"}, "the unit of the views is signed"),
-        ({"whiskers": 18}, "the number of whiskers is 18 and was 0"),
-        ({"kind": "whisker head"}, "the sensor is whisker head and was camera or laser"),
-        ({"geometry": {"touch.head.length": 2}}, "touch.head.length is 2 and was 1"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"view_shape": (1, 36, 1)}, r"the shape of the views is \(1, 36, 1\) and was \(3, 6, 1\)"),
+    ({"unit": "signed"}, "the unit of the views is signed"),
+    ({"whiskers": 18}, "the number of whiskers is 18 and was 0"),
+    ({"kind": "whisker head"}, "the sensor is whisker head and was camera or laser"),
+    ({"geometry": {"touch.head.length": 2}}, "touch.head.length is 2 and was 1"),
+])  # fmt: skip
 def test_other_sensors_are_refused(run: ratslam.Result, changes: dict, message: str) -> None:
     sensor = read_map(run.directory).sensor._replace(geometry={"touch.head.length": 1})
     sensor.check_same("map.npz", sensor._replace(transform={}))
-    with pytest.raises(InputError, match=f"map.npz: made with another sensor: {message}"):
+    with pytest.raises(ratslam.InputError, match=f"map.npz: made with another sensor: {message}"):
         sensor.check_same("map.npz", sensor._replace(**changes))
 
 
 def test_other_settings_of_a_sensor_are_named_with_those_of_the_map(run: ratslam.Result) -> None:
     views, sensor = "recording.topics.views", read_map(run.directory).sensor
     ours = {f"{views}.max_range": None, f"{views}.columns": 6, "templates.patch": 0}
-    theirs = {f"{views}.max_range": 5.0, f"{views}.columns": 4}
     of_map = sensor._replace(transform=ours)
-    other = of_map._replace(transform=theirs, view_shape=(3, 4, 1), cell=0.2)
-    with pytest.raises(InputError, match="made with other settings of the sensor: ") as caught:
-        of_map.check_same("map.npz", other)
+    theirs = {f"{views}.max_range": 5.0, f"{views}.columns": 4}
+    with pytest.raises(ratslam.InputError, match="made with other settings of the sensor: ") as caught:
+        of_map.check_same("map.npz", of_map._replace(transform=theirs, view_shape=(3, 4, 1), cell=0.2))
     cure = f"`--set {views}.max_range=null --set {views}.columns=6 --set pose_cells.cell_size=0.1`"
     assert cure in caught.value.cure
     assert "shape" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"drop": ("map/graph/pose",)}, "without 'pose'"),
-        ({"drop": ("state/3",)}, "another configuration or view shape"),
-        ({"map__graph__pose": np.zeros((3, 2))}, "could not broadcast"),
-        ({"map__graph__pose": np.zeros((3, 3), np.float32)}, "map/graph/pose of dtype float32"),
-        ({"map__graph__more": np.zeros(3)}, "the unknown array map/graph/more"),
-    ],
-)
-def test_arrays_that_do_not_fit_are_refused(run, session, tmp_path, changes, message):
-    saved = read_map(rewritten(run.directory / "map.npz", tmp_path / "map.npz", **changes))
-    with pytest.raises(InputError, match=message):
-        saved.restore(session, saved.config)
-
-
 @cache
 def content() -> tuple[bytes, dict[str, np.ndarray]]:
-    """The bytes and the arrays of a whole map file."""
     with np.load(FILE) as archive:
         return FILE.read_bytes(), {name: archive[name] for name in archive.files}
 
@@ -310,7 +277,7 @@ def test_spoilt_files_are_refused(count: int, tmp_path: Path) -> None:
         try:
             saved = read_map(path)
             saved.restore(session, saved.config)
-        except InputError as error:
+        except ratslam.InputError as error:
             return str(error)
         return ""
 
@@ -363,5 +330,4 @@ def test_a_killed_writer_leaves_a_whole_file(kills: int, tmp_path: Path) -> None
             process.kill()
         process.communicate()
         saved = read_map(path)
-        assert saved.steps == read_map(FILE).steps
-        assert len(saved.arrays["state/more"]) % 200_000 == 0
+        assert (saved.steps, len(saved.arrays["state/more"]) % 200_000) == (read_map(FILE).steps, 0)

@@ -34,7 +34,7 @@ create_simulation: {{reports: 60}}
 touch: {{reports: {{fold_back: true, walls: geometric}}}}
 """,
 }
-FORWARD = ratslam.Odometry(0.1, 0.0, 0.0, 1.0)
+FORWARD, DESCRIBED = ratslam.Odometry(0.1, 0.0, 0.0, 1.0), ratslam.SourceDescription((1, 8, 1), rate_hz=10.0)
 
 
 class Walk(NamedTuple):
@@ -117,7 +117,6 @@ def test_the_covariance_is_turned_to_the_map() -> None:
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A configuration without a source."""
     path = tmp_path_factory.mktemp("own") / "own.yaml"
     path.write_text(NO_SOURCE)
     return path
@@ -141,7 +140,7 @@ def test_a_source_is_given_once(own: Path, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def camera(own: Path) -> ratslam.Slam:
-    return ratslam.Slam(own, ratslam.SourceDescription((1, 8, 1), rate_hz=10.0))
+    return ratslam.Slam(own, DESCRIBED)
 
 
 def test_described_readings_are_mapped(camera: ratslam.Slam) -> None:
@@ -158,30 +157,23 @@ def still(**given: Any) -> ratslam.Observation:
     return ratslam.observation(FORWARD, **{"view_shape": (1, 8, 1)} | given)
 
 
-@pytest.mark.parametrize(
-    ("reading", "message"),
-    [
-        (still(view_shape=(1, 9, 1)), r"view: shape \(1, 9, 1\); expected \(1, 8, 1\)"),
-        (still(whiskers=4), r"contact: shape \(4,\)"),
-        (
-            still()._replace(odometry=FORWARD._replace(dx=np.nan)),
-            r"odometry\.dx: a number that is not finite",
-        ),
-        (still()._replace(label=np.float64(1.5)), "label: numbers of type float64; expected int32"),
-        (Whisk(FORWARD, *[np.zeros(18)] * 6), "a Whisk; expected an Observation"),
-    ],
-)
+@pytest.mark.parametrize(("reading", "message"), [
+    (still(view_shape=(1, 9, 1)), r"view: shape \(1, 9, 1\); expected \(1, 8, 1\)"),
+    (still(whiskers=4), r"contact: shape \(4,\)"),
+    (still()._replace(odometry=FORWARD._replace(dx=np.nan)), r"odometry\.dx: a number .* not finite"),
+    (still()._replace(label=np.float64(1.5)), "label: numbers of type float64; expected int32"),
+    (Whisk(FORWARD, *[np.zeros(18)] * 6), "a Whisk; expected an Observation"),
+])  # fmt: skip
 def test_readings_that_do_not_fit_change_nothing(camera, reading, message):
-    before, steps = camera.estimate, camera.steps
+    before = camera.estimate, camera.steps
     with pytest.raises(ratslam.InputError, match=message):
         camera.step(reading)
-    assert camera.estimate is before
-    assert camera.steps == steps
+    assert (camera.estimate, camera.steps) == before
 
 
 def test_other_dtypes_are_converted(own: Path) -> None:
     """Also those of the first observation, which the kernel is compiled for."""
-    exact, rough = (ratslam.Slam(own, ratslam.SourceDescription((1, 8, 1))) for _ in range(2))
+    exact, rough = ratslam.Slam(own, DESCRIBED), ratslam.Slam(own, DESCRIBED)
     view = np.full((1, 8, 1), 0.5)
     given = ratslam.observation(ratslam.Odometry(0.25, 0.0, 0.0, 1.0), view)
     odometry = ratslam.Odometry(0.25, 0, 0, 1)
@@ -200,19 +192,13 @@ HOSTILE = "<script>alert(1)</script> & \"'"
 
 
 @pytest.fixture(scope="module")
-def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("result") / "maze.yaml"
-    path.write_text(f"simulation: {{path: {{explore: 40}}}}\n{NO_SOURCE}")
-    return path
+def result(tmp_path_factory: pytest.TempPathFactory) -> ratslam.Result:
+    config = (folder := tmp_path_factory.mktemp("result")) / "maze.yaml"
+    config.write_text(f"simulation: {{path: {{explore: 40}}}}\n{NO_SOURCE}")
+    return ratslam.run(config, folder / HOSTILE.replace("/", "\N{DIVISION SLASH}"))
 
 
-@pytest.fixture(scope="module")
-def result(config: Path) -> ratslam.Result:
-    """A run whose name is HTML."""
-    return ratslam.run(config, config.parent / HOSTILE.replace("/", "\N{DIVISION SLASH}"))
-
-
-def test_a_result_has_the_parts_of_a_run(result: ratslam.Result) -> None:
+def test_a_result_has_the_parts_of_a_run_and_is_opened_again(result: ratslam.Result, tmp_path: Path) -> None:
     assert len(result.time) == 40
     for poses in (result.trajectory, result.odometry, result.truth):
         assert poses.shape == (40, 3)
@@ -223,10 +209,7 @@ def test_a_result_has_the_parts_of_a_run(result: ratslam.Result) -> None:
     assert np.isnan(result.health.doubt)
     assert "no loop closure was accepted" in result.health.reason
     assert (result.health.input, result.warnings, result.health.doubted) == ("clean", (), False)
-    assert not result.interrupted
-
-
-def test_a_directory_is_opened_again_and_others_are_refused(result: ratslam.Result, tmp_path: Path) -> None:
+    assert (result.interrupted, result.cells) == (False, None)
     again = ratslam.Result(result.directory)
     np.testing.assert_array_equal(again.trajectory, result.trajectory)
     assert again.scorecard == result.scorecard
@@ -234,12 +217,15 @@ def test_a_directory_is_opened_again_and_others_are_refused(result: ratslam.Resu
         ratslam.Result(tmp_path)
 
 
-def test_a_result_names_its_plots_and_says_how_good_it_is(result: ratslam.Result) -> None:
+def test_a_result_draws_its_plots_writes_its_report_and_says_how_good_it_is(result, tmp_path: Path) -> None:
     for name in ("map", "whiskers", "experiences"):
         assert len(result.plot(name).axes) > 0
     with pytest.raises(ratslam.InputError, match="plot: 'grid'; expected one of map, whiskers, experiences"):
         result.plot("grid")
     assert re.search(r"40 steps.*position error 0\.\d+ m \(odometry 0\.\d+\)", repr(result))
+    assert result.report(tmp_path / "page.html") == tmp_path / "page.html"
+    assert HOSTILE.replace("<", "&lt;").partition(">")[0] in (tmp_path / "page.html").read_text("utf-8")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
 def test_the_page_shows_map_and_scorecard_and_escapes_texts(result: ratslam.Result) -> None:
@@ -247,26 +233,17 @@ def test_the_page_shows_map_and_scorecard_and_escapes_texts(result: ratslam.Resu
     picture = (result.directory / "map.png").read_bytes()
     assert page.startswith(f'<div><img src="data:image/png;base64,{b64encode(picture).decode()}"')
     assert set(re.findall(r"<(\w+)", page)) == {"div", "img", "p", "table", "tr", "th", "td"}
-    rows = [re.findall(r"<t[hd][^>]*>([^<]*)<", row) for row in page.split("<tr")[1:]]
-    shown = [[unescape(cell) for cell in row] for row in rows]
+    rows = [[unescape(x) for x in re.findall(r"<t[hd][^>]*>([^<]*)<", row)] for row in page.split("<tr")[1:]]
     expected = [list(line) for lines in result.scorecard.lines().values() for line in lines]
-    assert [row for row in shown if row in expected] == expected
-    assert shown[0][0] == result.scorecard.name
-    assert shown[0][0].startswith("<script>")
+    assert [row for row in rows if row in expected] == expected
+    assert rows[0][0] == result.scorecard.name
     assert "<p>This map is the odometry" in page
 
 
-def test_a_result_writes_its_report(result: ratslam.Result, tmp_path: Path) -> None:
-    page = result.report(tmp_path / "page.html")
-    assert page == tmp_path / "page.html"
-    assert HOSTILE.replace("<", "&lt;").partition(">")[0] in page.read_text(encoding="utf-8")
-    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
-
-
-def test_runs_get_new_directories(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_get_new_directories(result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also in a thread, where Ctrl-C cannot be caught."""
     monkeypatch.chdir(tmp_path)
-    short = ratslam.load_config(config, ["simulation.path.explore=3"])
+    short = ratslam.load_config(result.directory / "config.yaml", ["simulation.path.explore=3"])
     (tmp_path / "runs" / "run").mkdir(parents=True)
     thread = threading.Thread(target=ratslam.run, args=(short,))
     thread.start()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,8 +27,6 @@ REACH = 0.1
 
 
 class Walk(NamedTuple):
-    """Observations [N] and true poses [N, 3]."""
-
     readings: list[Observation]
     truth: np.ndarray
 
@@ -64,9 +62,7 @@ def empty_session(reserve: int = 512, **keyframes: Any) -> Session:
     return session
 
 
-def empty_carried_session() -> Session:
-    """That of a robot that may be carried."""
-    return empty_session(may_be_carried=True)
+empty_carried_session = partial(empty_session, may_be_carried=True)
 
 
 def empty_merging_session(merge_stood: int, **keyframes: Any) -> Session:
@@ -75,7 +71,6 @@ def empty_merging_session(merge_stood: int, **keyframes: Any) -> Session:
 
 
 def simulate_walk(seed: int, dead: Sequence[int] = (), **simulation: Any) -> Walk:
-    """A simulated session."""
     config = config_of(simulation={"seed": seed} | LAPS | simulation, touch={"head": {"dead": tuple(dead)}})
     assert config.simulation is not None
     source = HeadSimulation(config.simulation, config.touch.head)
@@ -88,8 +83,7 @@ def simulate_walk(seed: int, dead: Sequence[int] = (), **simulation: Any) -> Wal
 def follow(session: Session, readings: Sequence[Observation]) -> MappedWalk:
     for _ in session.replay(readings):
         pass
-    settled = session.map.solution()
-    first = session.map.keyframe_steps()
+    settled, first = session.map.solution(), session.map.keyframe_steps()
     cuts = first[settled.cut.rows >= 0].tolist()
     return MappedWalk(session.map.trajectory(), session.map.closures(), cuts)
 
@@ -106,14 +100,13 @@ def metric(path: np.ndarray, truth: np.ndarray) -> float:
     return energy_all_pairs(path, truth).total
 
 
+def odometry_metric(walk: Walk) -> float:
+    return metric(dead_reckoning(walk.readings), walk.truth)
+
+
 def true_share(found: MappedWalk, truth: np.ndarray) -> float:
     apart = truth[found.closures[:, 0]] - truth[found.closures[:, 1]]
     return float((np.hypot(*apart[:, :2].T) < REACH).mean())
-
-
-def crossing(found: MappedWalk, step: int) -> int:
-    """The number of closures between poses before a step and poses after it."""
-    return int(((found.closures[:, 0] >= step) & (found.closures[:, 1] < step)).sum())
 
 
 def kidnap(walk: Walk, row: int, ahead: int) -> Walk:
@@ -138,6 +131,5 @@ def unseen(readings: list[Observation]) -> list[Observation]:
 
 
 def same_arrays(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
-    """Whether the arrays of two sessions are the same to the bit."""
     assert one.keys() == other.keys()
     return all(np.array_equal(one[name], other[name], equal_nan=one[name].dtype.kind == "f") for name in one)
