@@ -1,7 +1,5 @@
 """Benchmarks run with `make bench` and `make soak`, not with the test suite."""
 
-from __future__ import annotations
-
 import pytest
 
 

@@ -1,32 +1,20 @@
-"""Timings of parts, each on one core after compilation: maps, recall, grid filter, touch, scores of cells."""
+"""Timings on one core after compilation: maps, recall, grid filter, touch; a step of the pose cells."""
 
-from __future__ import annotations
-
+import time
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numba import njit
 
-from evaluation.cells.analysis import analyse_cells
-from evaluation.cells.head_direction import mean_vector_length, preferred_direction
-from evaluation.cells.information import information
-from evaluation.cells.rate_map import rate_maps, tuning_curves
-from evaluation.cells.recording import BinnedSums, CellRecording
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.exm import experience_metric
+from evaluation.papers.tables import speed
 from ratslam.core.session import Session
 from ratslam.grid.config import GridConfig
-from ratslam.mapping.optimizer import (
-    CalibrationPrior,
-    LoopClosures,
-    MapCovariance,
-    MapFit,
-    MapProblem,
-    OdometryChain,
-    solve,
-)
+from ratslam.mapping import optimizer
 from ratslam.methods.grid import GridBackend
 from ratslam.network import pose_cells
 from ratslam.network.config import Network, PoseCellConfig
@@ -39,7 +27,6 @@ from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.create.simulated_session import CreateSimulation, CreateSimulationConfig
 from robot.touch_source import open_touch_source, planar_whiskers_of
-from tactile.base.random_streams import stream
 from tactile.base.se2 import integrate
 from tactile.base.types import stack
 from tactile.frontend import TouchConfig
@@ -54,9 +41,6 @@ def timed(benchmark, call, count=1, rounds=5):
     return found
 
 
-# A closure in a map of 1000 frames
-
-
 @pytest.fixture(scope="module")
 def frame_map():
     """A square driven again and again with a biased gyro, closed wherever it was before."""
@@ -65,34 +49,31 @@ def frame_map():
     true = np.column_stack([np.full(frames - 1, 0.5), np.zeros(frames - 1), turn])
     motion = true - [0, 0, 0.001] + random.normal(0, [0.01, 0.01, 0.005], true.shape)
     later = random.integers(60, frames, closures)
-    chain = OdometryChain(motion, np.full(frames - 1, 0.5), np.tile([0.01, 0.01, 0.001], (frames - 1, 1)))
+    noise = np.tile([0.01, 0.01, 0.001], (frames - 1, 1))
+    chain = optimizer.OdometryChain(motion, np.full(frames - 1, 0.5), noise)
     path = np.concatenate([np.zeros((1, 3)), integrate(true)])
-    links = LoopClosures(
+    links = optimizer.LoopClosures(
         i=later % 48, j=later, turn=(path[later] - path[later % 48])[:, 2], sequence=np.arange(closures) // 5,
         variance=np.array([0.1, 0.1, 0.02]), scale=np.full(closures // 5, 6.0),
     )  # fmt: skip
-    begin = MapFit(np.concatenate([np.zeros((1, 3)), integrate(motion)]), 0.0, np.zeros(0))
-    return begin, MapProblem(chain, links, CalibrationPrior(0.0, 0.01, 0.0, 0.05))
+    begin = optimizer.MapFit(np.concatenate([np.zeros((1, 3)), integrate(motion)]), 0.0, np.zeros(0))
+    return begin, optimizer.MapProblem(chain, links, optimizer.CalibrationPrior(0.0, 0.01, 0.0, 0.05))
 
 
 def test_a_map_of_1000_frames_is_solved(benchmark, frame_map):
-    fit = timed(benchmark, partial(solve, *frame_map, iterations=4))
+    fit = timed(benchmark, partial(optimizer.solve, *frame_map, iterations=4))
     assert abs(fit.bias - 0.002) < 0.001
 
 
 def test_a_closure_is_checked_against_the_covariance(benchmark, frame_map):
-    fit = solve(*frame_map, iterations=4)
-    timed(benchmark, lambda: MapCovariance(fit, frame_map[1]).relative(5, 999, 0.0))
-
-
-# Recall
+    fit = optimizer.solve(*frame_map, iterations=4)
+    timed(benchmark, lambda: optimizer.MapCovariance(fit, frame_map[1]).relative(5, 999, 0.0))
 
 
 @pytest.mark.parametrize("shifts", [0, 3])
 @pytest.mark.parametrize("frames", [1500, 100_000])
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_one_recall(benchmark, frames, shifts, dtype):
-    """One frame compared with many remembered ones, and the pose cells driven by them."""
+def test_one_recall(benchmark, frames, shifts):
+    dtype = "float64"
     cell, config, random = 0.6, RecallConfig(shifts=shifts), np.random.default_rng(0)
     capacity = 1 << (frames - 1).bit_length()
     turns = np.cumsum(random.normal(0, 0.3, frames))
@@ -128,23 +109,17 @@ def test_one_recall(benchmark, frames, shifts, dtype):
     assert 0 < float(after.activity.sum()) <= 1 + 1e-3
 
 
-# The grid filter
-
-
 @pytest.fixture(scope="module")
 def arena():
-    """512 reports of a simulated Create, and its whiskers."""
     source, touch = CreateSimulation(CreateSimulationConfig(reports=512, seed=5)), TouchConfig()
     return [sample.reading for sample in open_touch_source(source, touch)], planar_whiskers_of(source, touch)
 
 
-@pytest.mark.parametrize(("particles", "dtype"), [
-    (100, np.float32), (100, np.float64), (1000, np.float32), (10_000, np.float32),
-])  # fmt: skip
-def test_grid_replay(benchmark, arena, particles, dtype):
+@pytest.mark.parametrize("particles", [100, 1000])
+def test_grid_replay(benchmark, arena, particles):
     reports, feelers = arena
-    rows = reports[: 512 if particles < 5000 else 64] if benchmark.enabled else reports[:8]
-    particles = particles if benchmark.enabled else 100
+    rows = reports if benchmark.enabled else reports[:8]
+    particles, dtype = particles if benchmark.enabled else 100, np.float32
     method = GridBackend(GridConfig(particles=particles), feelers, 2.5, dtype)
 
     def step(state, observation):
@@ -163,9 +138,6 @@ def test_grid_live(benchmark, arena):
     live = Session(GridBackend(GridConfig(particles=100), feelers, 2.5, np.float32), precision="float32")
     live.step(next(rows))
     timed(benchmark, lambda: live.step(next(rows)), rounds=500)
-
-
-# Touch: simulated seconds per second of computation
 
 
 def simulated(**simulation):
@@ -203,33 +175,128 @@ def test_one_circuit_is_simulated(benchmark, tier):
     timed(benchmark, one, len(one()[3]), rounds=3)
 
 
-# Scores of all cells of the default network: 20 x 20 bins of place, 36 of heading
-
-CELLS = 36 * 21 * 21
-
-
-@pytest.fixture(scope="module")
-def recording():
-    """Sums of 600 s in random amounts."""
-    draw = stream(0, "sums")
-    seconds, held = draw.exponential(1.5, (20, 20)), draw.exponential(600 / 36, 36)
-    place = draw.exponential(1 / CELLS, (CELLS, 20, 20)) * seconds
-    heading = draw.exponential(1 / CELLS, (CELLS, 36)) * held
-    edges, none = np.linspace(0, 1, 21), np.zeros(0)
-    sums = BinnedSums(edges, edges, seconds, place.astype(np.float32), held, heading.astype(np.float32))
-    return CellRecording((36, 21, 21), 0.05, none, none, none, none, none, none, none, sums)
+def kernel(width: int, sigma: float) -> np.ndarray:
+    at = np.arange(width) - width // 2
+    squares = at[:, None, None] ** 2 + at[None, :, None] ** 2 + at[None, None, :] ** 2
+    weight = np.exp(-squares / (2 * sigma**2))
+    return weight / weight.sum()
 
 
-def test_maps_information_and_tuning_of_all_cells(benchmark, recording):
-    sums = recording.sums
+@njit(cache=False)
+def scatter(p, weight, out):
+    k, n, m = p.shape
+    half = weight.shape[0] // 2
+    out[:] = 0.0
+    for h, y, x in np.ndindex(k, n, m):
+        if p[h, y, x] != 0.0:
+            for a, b, c in np.ndindex(weight.shape):
+                i, j = (h + a - half) % k, (y + b - half) % n
+                out[i, j, (x + c - half) % m] += p[h, y, x] * weight[a, b, c]
 
-    def score():
-        maps, curves = rate_maps(sums), tuning_curves(sums)
-        turn = curves, sums.heading_seconds
-        return information(maps, sums.seconds), mean_vector_length(*turn), preferred_direction(*turn)
 
-    assert all(len(column) == CELLS for column in timed(benchmark, score))
+@njit(cache=False)
+def threshold(p, q, g):
+    total = 0.0
+    for cell in np.ndindex(p.shape):
+        left = p[cell] - q[cell]
+        p[cell] = left - g if left >= g else 0.0
+        total += p[cell]
+    for cell in np.ndindex(p.shape):
+        p[cell] /= total
 
 
-def test_all_scores_of_all_cells(benchmark, recording):
-    assert len(timed(benchmark, partial(analyse_cells, recording)).cell) == CELLS
+@njit(cache=False)
+def shift(p, out, d, turn):
+    k, n, m = p.shape
+    out[:] = 0.0
+    st, at = (1 if turn >= 0 else -1), abs(turn)
+    for h in range(k):
+        angle = h * 2 * np.pi / k
+        dx, dy = d * np.cos(angle), d * np.sin(angle)
+        sx, sy, ax, ay = (1 if dx >= 0 else -1), (1 if dy >= 0 else -1), abs(dx), abs(dy)
+        for y, x in np.ndindex(n, m):
+            for i, wt in ((h, 1 - at), ((h + st) % k, at)):
+                for j, wy in ((y, 1 - ay), ((y + sy) % n, ay)):
+                    out[i, j, x] += p[h, y, x] * wt * wy * (1 - ax)
+                    out[i, j, (x + sx) % m] += p[h, y, x] * wt * wy * ax
+
+
+@njit(cache=False)
+def peak(p):
+    best, where = -1.0, (0, 0, 0)
+    for cell in np.ndindex(p.shape):
+        if p[cell] > best:
+            best, where = p[cell], cell
+    return where
+
+
+def loops(n, k=36):
+    """A step of the compiled loops, which has been compiled."""
+    excite, inhibit = kernel(7, 1.0), kernel(5, 2.0)
+    activity, first, second = np.zeros((3, k, n, n))
+    activity[k // 2, n // 2, n // 2] = 1
+
+    def step():
+        scatter(activity, excite, first)
+        scatter(first, inhibit, second)
+        threshold(first, second, 2e-5)
+        shift(first, activity, *speed.MOTION)
+        return peak(activity)
+
+    step()
+    return step
+
+
+@pytest.mark.parametrize("n", [11, 21, 41, 61, 101, 201])
+def test_replay(benchmark, n):
+    if benchmark.enabled:
+        calls, few, loop = speed.network_calls(n), max(5, 400 // n), loops(n)
+        calls["loop"] = (lambda: [loop() for _ in range(few)], few)
+    elif n in (11, 41):
+        window, start = speed.replay_network(n, "window", 10)
+        calls = {"window": (partial(window, start), 10)}
+    else:
+        pytest.skip("timed by make bench only")
+    us = speed.interleaved_medians(calls)
+    after, above = benchmark.pedantic(calls["window"][0], rounds=1)
+    assert int(above) == 0
+    assert np.isfinite(after.pose).all()
+    ratio = {name: us.get("numpy", np.nan) / value for name, value in us.items()}
+    benchmark.extra_info.update(us=us, ratio=ratio)
+    print(f"\n{n} x {n} x 36: us {us}, times as fast as NumPy {ratio}")
+
+
+@pytest.mark.parametrize("n", [41, 101])
+def test_two_packets(benchmark, n):
+    if not benchmark.enabled:
+        pytest.skip("timed by make bench only")
+    steps = 2000
+    alone, start = speed.replay_network(n, "window", steps)
+    pairs, _ = speed.replay_network(n, "window", steps, every=4)
+    calls = {"one": (partial(alone, start), steps), "two": (partial(pairs, start), steps)}
+    us = speed.interleaved_medians(calls)
+    _, above = benchmark.pedantic(pairs, args=(start,), rounds=1)
+    share = int(above) / steps
+    assert share > 0.5
+    pair = us["one"] + (us["two"] - us["one"]) / share
+    benchmark.extra_info.update(us=us, share=share, us_of_a_step_with_two=pair)
+    print(f"\n{n}: one packet {us['one']:.0f} us, two {pair:.0f} us ({share:.0%} of the steps)")
+
+
+@pytest.mark.parametrize("n", [21, 101])
+def test_live(benchmark, n):
+    if not benchmark.enabled and n != 21:
+        pytest.skip("timed by make bench only")
+    step, cells = speed.network_step(n, "window")
+    live = jax.jit(step, donate_argnums=0)
+    nowhere, nothing = np.zeros(3), np.zeros(())
+    took = []
+    for _ in range(3000 if benchmark.enabled else 20):
+        start = time.perf_counter()
+        cells, _told = live(cells, nowhere, nothing)
+        np.asarray(cells.pose)
+        took.append((time.perf_counter() - start) * 1e6)
+    half, most = np.quantile(took[10:], [0.5, 0.99])
+    benchmark.extra_info.update(p50=half, p99=most)
+    print(f"\n{n} live: p50 {half:.0f} us, p99 {most:.0f} us")
+    benchmark.pedantic(np.asarray, args=(cells.pose,), rounds=1)

@@ -1,8 +1,5 @@
-"""Paths of reference data, and small runs whose right answers are known."""
+"""Reference traces, and small runs whose right answers are known."""
 
-from __future__ import annotations
-
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,34 +9,17 @@ import pytest
 from evaluation.metrics.run_metrics import RunArrays
 from tactile.base.se2 import compose, integrate, inverse
 
-_ROOT = Path(__file__).parents[2]
-
-
-def _reference() -> Path:
-    return Path(os.environ.get("RATSLAM_DATA", _ROOT.parent / "shared" / "reference"))
-
 
 @pytest.fixture(scope="session")
-def data() -> Callable[[str], Path]:
-    """The path of a reference file; skips the test where it is missing."""
-
-    def find(name: str) -> Path:
-        path = _reference() / name
-        if not path.is_file():
-            pytest.skip(f"{name} is not under ${{RATSLAM_DATA}} ({_reference()})")
-        return path
-
-    return find
-
-
-@pytest.fixture(scope="session")
-def trace(data: Callable[[str], Path]) -> Callable[[str], dict[str, np.ndarray]]:
+def trace(golden: Path, request: pytest.FixtureRequest) -> Callable[[str], dict[str, np.ndarray]]:
     """A recorded run of the reference implementation; the synthetic ones are part of the project."""
 
     def load(name: str) -> dict[str, np.ndarray]:
-        golden = _ROOT / "tests" / "golden" / f"{name}.npz"
-        with np.load(golden if golden.is_file() else data(f"traces/{name}.npz")) as file:
-            return {key: file[key] for key in file.files}
+        path = golden / f"{name}.npz"
+        if not path.is_file():
+            path = request.getfixturevalue("reference_data") / "traces" / f"{name}.npz"
+        with np.load(path) as file:
+            return dict(file)
 
     return load
 
@@ -71,16 +51,9 @@ def circle() -> RunArrays:
     truth = integrate(motion, np.array([2.0, 1.0, 0.5]))
     elsewhere = np.array([-1.0, 0.5, 2.0])
     final = compose(elsewhere, compose(inverse(truth[0]), truth))
-    places_ = np.arange(laps * places) % places
-    links = np.stack([np.arange(places), (np.arange(places) + 1) % places], axis=1)
+    step, place = np.arange(laps * places), np.arange(places)
     return RunArrays(
-        time=100.0 + np.arange(laps * places) / 2,
-        truth=truth,
-        online=final,
-        final=final,
-        odometry=integrate(motion * np.array([1.0, 1.0, 1.03])),
-        experience=places_,
-        created=np.arange(places),
-        nodes=final[:places],
-        links=links,
-    )
+        100.0 + step / 2, truth, online=final, final=final, odometry=integrate(motion * [1.0, 1.0, 1.03]),
+        experience=step % places, created=place, nodes=final[:places],
+        links=np.stack([place, (place + 1) % places], axis=1),
+    )  # fmt: skip

@@ -22,9 +22,5 @@ def square(word, side=12):
 
 def session(truth, **given):
     still = dict.fromkeys(("truth", "odometry", "trajectory", "node", "live"), truth)
-    still |= {
-        "place": np.arange(len(truth)),
-        "piece": np.zeros(len(truth), int),
-        "closures": np.zeros((0, 2), int),
-    }
-    return SessionResult(**still | given)
+    still |= {"place": np.arange(len(truth)), "piece": np.zeros(len(truth), int)}
+    return SessionResult(**still | {"closures": np.zeros((0, 2), int)} | given)

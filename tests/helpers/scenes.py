@@ -7,6 +7,8 @@ traces have.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from robot.sources.in_memory import InMemorySource
@@ -35,8 +37,7 @@ def square(seed: int, laps: int = 3, jumps: tuple[tuple[int, int], ...] = ()) ->
 def figure_eight(seed: int, laps: int = 6, shared: float = 1 / 3) -> InMemorySource:
     """Two circles in turn, like b_figure8_alias: a share of the second one's places look like the first's."""
     left, right = [(STEP, np.pi / 18)] * 36, [(STEP, -np.pi / 18)] * 36
-    path = followed((left + right) * laps)
-    return sensed(path, seed, shared=shared)
+    return sensed(followed((left + right) * laps), seed, shared=shared)
 
 
 def corridor(seed: int, length: int = 400) -> InMemorySource:
@@ -53,9 +54,7 @@ def followed(moves: list[tuple[float, float]]) -> np.ndarray:
     return np.stack([x, y, heading], axis=1)
 
 
-def sensed(
-    path: np.ndarray, seed: int, carried: list[int] | None = None, shared: float = 0.0
-) -> InMemorySource:
+def sensed(path: np.ndarray, seed: int, carried: Sequence[int] = (), shared: float = 0.0) -> InMemorySource:
     """Log of a robot on a path [N, 3].
 
     Args:
@@ -65,7 +64,7 @@ def sensed(
     count = len(path)
     motion = np.zeros((count, 4))
     motion[1:, :3] = between(path[:-1], path[1:])
-    for row in carried or []:
+    for row in carried:
         motion[row, :3] = STEP, 0.0, 0.0
     scale, bias = stream.normal(1, 0.015), stream.normal(0, 0.002)
     motion[1:, 0] += stream.normal(0, 0.001, count - 1)
@@ -85,15 +84,9 @@ def sensed(
 def recorded(path: np.ndarray, motion: np.ndarray, views: np.ndarray) -> InMemorySource:
     """A log of these rows."""
     count = len(path)
+    yes, label = np.ones(count, bool), np.full(count, -1, np.int32)
     return InMemorySource(
-        name="scene",
-        digest="",
-        time=0.5 * np.arange(count),
-        motion=motion,
-        moved=np.ones(count, bool),
-        views=views.reshape(count, 3, 6, 1).copy(),
-        seen=np.ones(count, bool),
-        label=np.full(count, -1, np.int32),
-        truth=np.column_stack([path[:, :2], wrap(path[:, 2])]),
-        info=SourceInfo(cell_size=CELL),
-    )
+        name="scene", digest="", time=0.5 * np.arange(count), motion=motion, moved=yes,
+        views=views.reshape(count, 3, 6, 1).copy(), seen=yes.copy(), label=label,
+        truth=np.column_stack([path[:, :2], wrap(path[:, 2])]), info=SourceInfo(cell_size=CELL),
+    )  # fmt: skip

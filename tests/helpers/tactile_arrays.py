@@ -8,7 +8,7 @@ that of the head, in equal parts for the samples between two whisks.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
@@ -52,8 +52,7 @@ class _Contacts(NamedTuple):
 def taxel_pressures(head: Head, push: np.ndarray, contacts: _Contacts) -> np.ndarray:
     """[N, 3, 22, 1] forces on taxels, N, of whiskers that push [N, W], N; one between two presses both."""
     columns = head.shape[1]
-    azimuth = np.arctan2(head.rest[:columns, 1], head.rest[:columns, 0])
-    middle = 2 * np.pi * np.arange(COLUMNS) / COLUMNS
+    azimuth, middle = np.arctan2(*head.rest[:columns, 1::-1].T), 2 * np.pi * np.arange(COLUMNS) / COLUMNS
     apart = np.abs((azimuth[:, None] - middle + np.pi) % (2 * np.pi) - np.pi)
     share = np.clip(1 - apart * COLUMNS / (2 * np.pi), 0, 1)  # [C, 22]
     rings = push.reshape(len(push), ROWS, columns)
@@ -72,9 +71,7 @@ def wrenches(head: Head, push: np.ndarray, contacts: _Contacts) -> np.ndarray:
 Response = Callable[[Head, np.ndarray, _Contacts], np.ndarray]
 
 
-def _open(
-    config: ArrayConfig, name: str, response: Response, scale: np.ndarray, whiskers: int
-) -> InMemorySource:
+def _open(config: ArrayConfig, name: str, response: Response, scale: Any, whiskers: int) -> InMemorySource:
     made = HeadSimulation(config.simulation)
     assert made.features is not None, "the kinematic fidelity"
     rate = config.simulation.whisking.rate
@@ -92,19 +89,13 @@ def _open(
     views += scale * config.noise * stream(config.simulation.seed, name).standard_normal(views.shape)
     motion = np.zeros((len(time), 4))
     motion[1:] = split_motions(made.odometry[1:], count)
+    yes, label = np.ones(len(time), bool), np.full(len(time), -1, np.int32)
     return InMemorySource(
-        name=name,
-        digest=digest_of_document({"array": name, "settings": config.model_dump(mode="json")}),
-        time=time,
-        motion=motion,
-        moved=np.ones(len(time), bool),
-        views=views,
-        seen=np.ones(len(time), bool),
-        label=np.full(len(time), -1, np.int32),
-        truth=wrap_headings(poses_at(made.scene.path, time)),
+        name=name, digest=digest_of_document({"array": name, "settings": config.model_dump(mode="json")}),
+        time=time, motion=motion, moved=yes, views=views, seen=yes.copy(), label=label,
+        truth=wrap_headings(poses_at(made.scene.path, time)), alive=np.ones(whiskers, bool),
         info=made.info.model_copy(update={"head": None, "simulation": None, "provenance": {}}),
-        alive=np.ones(whiskers, bool),
-    )
+    )  # fmt: skip
 
 
 def split_motions(motion: np.ndarray, parts: int) -> np.ndarray:
@@ -121,9 +112,7 @@ def split_motions(motion: np.ndarray, parts: int) -> np.ndarray:
     return part.repeat(parts, axis=0)
 
 
-TAXELS = SourceEntry(
-    ArrayConfig, lambda c, warn: _open(c, "taxels", taxel_pressures, np.ones(()), ROWS * COLUMNS)
-)
+TAXELS = SourceEntry(ArrayConfig, lambda c, warn: _open(c, "taxels", taxel_pressures, 1.0, ROWS * COLUMNS))
 """A taxel array; its readings are forces, N."""
 WRENCH_SCALE = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])[:, None]
 WRENCH = SourceEntry(ArrayConfig, lambda c, warn: _open(c, "wrench", wrenches, WRENCH_SCALE, 0))
@@ -145,8 +134,7 @@ class WrenchFrontend:
     view_shape, whiskers = (1, 6, 1), 0
 
     def __init__(self, config: WrenchConfig) -> None:
-        self.frames = config.frames
-        self.full = np.repeat([config.force, config.torque], 3)[:, None]
+        self.frames, self.full = config.frames, np.repeat([config.force, config.torque], 3)[:, None]
         self._clear()
 
     def _clear(self) -> None:

@@ -1,7 +1,5 @@
 """A random walk in a box and cells whose tuning is known; maps of known lattices, and of noise."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -47,47 +45,30 @@ def mixed_cells(walk: Walk) -> np.ndarray:
     """[T, 10]: six place cells, two direction cells, a cell along the left wall and one always active."""
     centres = np.array([[0.2, 0.3], [0.5, 0.5], [0.8, 0.2], [0.7, 0.8], [0.35, 0.7], [0.9, 0.9]])
     along = np.exp(-walk.truth[:, :1] / 0.05)
-    return np.concatenate(
-        [
-            place_cells(walk.truth[:, :2], centres),
-            direction_cells(walk.truth[:, 2], np.array([0.5, 4.0])),
-            along,
-            np.ones_like(along),
-        ],
-        axis=1,
+    places, turns = (
+        place_cells(walk.truth[:, :2], centres),
+        direction_cells(walk.truth[:, 2], np.array([0.5, 4.0])),
     )
+    return np.concatenate([places, turns, along, np.ones_like(along)], axis=1)
 
 
 def mixed_sums(walk: Walk) -> BinnedSums:
-    """The sums of `mixed_cells` in 20 x 20 bins and 36 headings."""
     return bin_activity(*walk, mixed_cells(walk), EDGES, EDGES, 36)
 
 
 def sheet_recording(walk: Walk, cells: np.ndarray, drift: np.ndarray | None = None) -> CellRecording:
-    """A recording of a perfect sheet: cells [C] fire round their place on the torus.
-
-    Args:
-        drift: [T, 3] m, m, rad, added to the pose that the sheet shows.
-    """
+    """A perfect sheet that shows poses off by drift [T, 3]: cells [C] fire round their place on the torus."""
     side = np.array([SHAPE[2] * CELL_SIZE, SHAPE[1] * CELL_SIZE, 2 * np.pi])
     pose = (walk.truth + (0 if drift is None else drift)) % side
     heading, row, column = np.unravel_index(cells, SHAPE)
     own = np.stack([column * CELL_SIZE, row * CELL_SIZE, heading * 2 * np.pi / SHAPE[0]], axis=1)
     angle = 2 * np.pi * (pose[:, None] - own) / side
     activity = np.exp((np.cos(angle) - 1) @ np.array([6.0, 6.0, 4.0]))
-    packet = pose / np.array([CELL_SIZE, CELL_SIZE, 2 * np.pi / SHAPE[0]])
+    packet, steps = pose / np.array([CELL_SIZE, CELL_SIZE, 2 * np.pi / SHAPE[0]]), len(walk.time)
     return CellRecording(
-        shape=SHAPE,
-        cell_size=CELL_SIZE,
-        time=walk.time,
-        truth=walk.truth.copy(),
-        packet=packet,
-        energy=np.zeros(len(walk.time)),
-        place=np.full(len(walk.time), -1, np.int32),
-        cell=cells.astype(np.int32),
-        activity=activity.astype(np.float32),
-        sums=None,
-    )
+        SHAPE, CELL_SIZE, walk.time, walk.truth.copy(), packet, np.zeros(steps), np.full(steps, -1, np.int32),
+        cells.astype(np.int32), activity.astype(np.float32), None,
+    )  # fmt: skip
 
 
 def lattice_map(directions: int, spacing: float, turn: float, shape: tuple[int, int]) -> np.ndarray:

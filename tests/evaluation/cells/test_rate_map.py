@@ -1,7 +1,5 @@
 """Rate maps, tuning curves and the file of recorded cells: occupancy, smoothing, bad input."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
@@ -25,43 +23,30 @@ from tests.evaluation.cells.box_walk import EDGES, mixed_cells, mixed_sums, rand
 WALK = random_walk()
 
 
-def test_all_time_and_activity_lies_in_some_bin() -> None:
+def test_all_time_lies_in_some_bin_and_maps_of_a_walk_are_laws_of_their_sums() -> None:
     sums = mixed_sums(WALK)
     total = (mixed_cells(WALK) * rate_map.sample_seconds(WALK.time)[:, None]).sum(axis=0)
-    assert_allclose(sums.seconds.sum(), 600, rtol=1e-9)
-    assert_allclose(sums.heading_seconds.sum(), 600, rtol=1e-9)
+    assert_allclose([sums.seconds.sum(), sums.heading_seconds.sum()], 600, rtol=1e-9)
     assert_allclose(sums.place.sum(axis=(1, 2)), total, rtol=1e-9)
     assert_allclose(sums.heading.sum(axis=1), total, rtol=1e-9)
-
-
-def test_bins_with_too_little_time_have_no_rate() -> None:
-    sums = mixed_sums(WALK)
+    # Bins with too little time have no rate.
     rates = rate_map.rate_maps(sums, least_seconds=1.0)
     assert (np.isnan(rates) == (sums.seconds < 1.0)).all()
     assert 0 < np.isnan(rates[0]).sum() < 400
+    # Finished maps are smoothed as sums are.
+    rates = rate_map.smooth_rates(rate_map.rate_maps(sums, 0.0, 1e-3), sums.seconds, 1.5)
+    assert_allclose(rates, rate_map.rate_maps(sums, 1.5, 1e-3), rtol=1e-9)
+    # A cell that is always active has a flat map.
+    maps = (rate_map.rate_maps(sums, smoothing)[9] for smoothing in (0.0, 1.5))
+    for found in (*maps, rate_map.tuning_curves(sums)[9]):
+        assert_allclose(found[np.isfinite(found)], 1.0, rtol=1e-12)
 
 
 @given(st.integers(3, 25), st.integers(3, 25), st.floats(0.3, 5.0))
 def test_smoothing_keeps_the_sum(height: int, width: int, sigma: float) -> None:
     values = stream(height * 100 + width, "smoothing").random((2, height, width))
-    assert_allclose(
-        rate_map.smooth_plane(values, sigma).sum(axis=(1, 2)), values.sum(axis=(1, 2)), rtol=1e-12
-    )
-
-
-def test_finished_maps_are_smoothed_as_sums_are() -> None:
-    sums = mixed_sums(WALK)
-    rates = rate_map.smooth_rates(rate_map.rate_maps(sums, 0.0, 1e-3), sums.seconds, 1.5)
-    assert_allclose(rates, rate_map.rate_maps(sums, 1.5, 1e-3), rtol=1e-9)
-
-
-def test_a_cell_that_is_always_active_has_a_flat_map() -> None:
-    sums = mixed_sums(WALK)
-    for found in (
-        *(rate_map.rate_maps(sums, smoothing)[9] for smoothing in (0.0, 1.5)),
-        rate_map.tuning_curves(sums)[9],
-    ):
-        assert_allclose(found[np.isfinite(found)], 1.0, rtol=1e-12)
+    smooth = rate_map.smooth_plane(values, sigma)
+    assert_allclose(smooth.sum(axis=(1, 2)), values.sum(axis=(1, 2)), rtol=1e-12)
 
 
 def test_poses_outside_or_unknown_lie_in_no_bin_and_the_last_edge_in_the_last_bin() -> None:
@@ -82,23 +67,20 @@ def binned(time: np.ndarray = TIME, truth: np.ndarray = TRUTH) -> BinnedSums:
     return rate_map.bin_activity(time, truth, ACTIVITY, EDGES, EDGES)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "named"),
-    [
-        (lambda sums: binned(truth=TRUTH * np.nan), "no known pose"),
-        (lambda sums: binned(truth=TRUTH + 7), "no time is spent"),
-        (lambda sums: binned(truth=TRUTH[:4]), "equal lengths"),
-        (lambda sums: binned(time=TIME[::-1]), "rising times"),
-        (lambda sums: rate_map.arena_edges(TRUTH * np.nan), "no known pose"),
-        (lambda sums: rate_map.arena_edges(TRUTH), "without width"),
-        (lambda sums: rate_map.rate_maps(sums._replace(seconds=np.zeros((20, 20)))), "visited arena"),
-        (lambda sums: rate_map.rate_maps(sums._replace(seconds=np.ones((20, 19)))), r"sums\.place"),
-        (lambda sums: rate_map.tuning_curves(sums._replace(heading_seconds=np.zeros(36))), "visited arena"),
-        (lambda sums: rate_map.tuning_curves(sums._replace(heading_seconds=np.ones(35))), r"sums\.heading"),
-        (lambda sums: rate_map.weigh_bins(np.ones((2, 5)), np.zeros(5)), "no time in any bin"),
-        (lambda sums: rate_map.weigh_bins(np.ones((2, 5)), np.ones(6)), "bins of the rates"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "named"), [
+    (lambda sums: binned(truth=TRUTH * np.nan), "no known pose"),
+    (lambda sums: binned(truth=TRUTH + 7), "no time is spent"),
+    (lambda sums: binned(truth=TRUTH[:4]), "equal lengths"),
+    (lambda sums: binned(time=TIME[::-1]), "rising times"),
+    (lambda sums: rate_map.arena_edges(TRUTH * np.nan), "no known pose"),
+    (lambda sums: rate_map.arena_edges(TRUTH), "without width"),
+    (lambda sums: rate_map.rate_maps(sums._replace(seconds=np.zeros((20, 20)))), "visited arena"),
+    (lambda sums: rate_map.rate_maps(sums._replace(seconds=np.ones((20, 19)))), r"sums\.place"),
+    (lambda sums: rate_map.tuning_curves(sums._replace(heading_seconds=np.zeros(36))), "visited arena"),
+    (lambda sums: rate_map.tuning_curves(sums._replace(heading_seconds=np.ones(35))), r"sums\.heading"),
+    (lambda sums: rate_map.weigh_bins(np.ones((2, 5)), np.zeros(5)), "no time in any bin"),
+    (lambda sums: rate_map.weigh_bins(np.ones((2, 5)), np.ones(6)), "bins of the rates"),
+])  # fmt: skip
 def test_unfit_paths_and_sums_are_refused(wrong, named: str) -> None:
     with pytest.raises(InputError, match=named):
         wrong(mixed_sums(WALK))
@@ -137,48 +119,24 @@ def test_a_recording_is_read_as_it_was_written_and_equal_ones_give_equal_bytes(t
         np.testing.assert_array_equal(read, written)
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [
-        {"format": np.array("ratslam-cells-9")},
-        {"activity": np.zeros((STEPS, CHOSEN + 1), np.float32)},
-        {"truth": np.zeros((STEPS, 2))},
-        {"energy": np.zeros(STEPS - 1)},
-        {"cell": np.array([0, 1, 2, 3, 36], np.int32)},
-        {"cell": np.array([0, 1, 2, 3, -1], np.int32)},
-        {"shape": np.array([4, 3])},
-        {"sums/seconds": np.zeros((3, 2))},
-        {"sums/heading": np.zeros((35, 6))},
-    ],
-    ids=lambda changed: next(iter(changed)),
-)
-def test_arrays_that_do_not_fit_are_refused(tmp_path, changed):
-    file = tmp_path / "cells.npz"
-    write_recording(file, made(True))
-    with np.load(file) as archive:
-        arrays = dict(archive)
-    np.savez(file, **arrays | changed)
-    with pytest.raises(InputError, match=r"cells\.npz: another kind of file"):
-        read_recording(file)
-
-
-def test_broken_foreign_and_missing_files_are_refused(tmp_path):
+def test_broken_foreign_and_missing_files_and_arrays_that_do_not_fit_are_refused(tmp_path):
     file = tmp_path / "cells.npz"
     write_recording(file, made(True))
     content = file.read_bytes()
-    for spoilt in (content[: len(content) // 2], b"", b"text"):
-        file.write_bytes(spoilt)
-        with pytest.raises(InputError, match="another kind of file"):
+    with np.load(file) as archive:
+        arrays = dict(archive)
+    for spoilt in (
+        content[: len(content) // 2], b"", b"text", {"a": np.zeros(3)}, arrays | {"format": np.array("9")},
+        arrays | {"activity": np.zeros((STEPS, 6), np.float32)}, arrays | {"truth": np.zeros((STEPS, 2))},
+        arrays | {"energy": np.zeros(STEPS - 1)}, arrays | {"cell": np.array([0, 1, 2, 3, 36], np.int32)},
+        arrays | {"cell": np.array([0, 1, 2, 3, -1], np.int32)}, arrays | {"shape": np.array([4, 3])},
+        arrays | {"sums/seconds": np.zeros((3, 2))}, arrays | {"sums/heading": np.zeros((35, 6))},
+    ):  # fmt: skip
+        np.savez(file, **spoilt) if isinstance(spoilt, dict) else file.write_bytes(spoilt)
+        with pytest.raises(InputError, match=r"cells\.npz: another kind of file"):
             read_recording(file)
-    np.savez(file, a=np.zeros(3))
-    with pytest.raises(InputError, match="another kind of file"):
-        read_recording(file)
     with pytest.raises(InputError, match="no such file"):
         read_recording(tmp_path / "none.npz")
-
-
-RATE = 8.0
-"""Spikes/s of a cell with activity 1."""
 
 
 def _import(name: str) -> ModuleType:
@@ -198,30 +156,24 @@ def opexebo() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def spikes() -> np.ndarray:
-    """[T, 10] number of spikes in each step of 0.05 s."""
-    return stream(0, "spikes").poisson(mixed_cells(WALK) * RATE * 0.05)
+    """[T, 10] number of spikes in each step of 0.05 s, 8 spikes/s at activity 1."""
+    return stream(0, "spikes").poisson(mixed_cells(WALK) * 8.0 * 0.05)
 
 
 @pytest.fixture(scope="module")
 def sums(spikes: np.ndarray) -> BinnedSums:
-    """Sums whose rates are in spikes/s."""
     return rate_map.bin_activity(*WALK, spikes / 0.05, EDGES, EDGES, 36)
 
 
-@pytest.fixture(scope="module")
-def theirs(opexebo: ModuleType, spikes: np.ndarray) -> tuple[list[np.ma.MaskedArray], np.ma.MaskedArray]:
-    """opexebo's unsmoothed maps and occupancy."""
+def test_occupancy_and_maps_are_those_of_opexebo(
+    opexebo: ModuleType, spikes: np.ndarray, sums: BinnedSums
+) -> None:
     keys = {"bin_edges": (EDGES, EDGES), "limits": (0.0, 1.0, 0.0, 1.0)}
     occupancy, _, _ = _quietly(opexebo.analysis.spatial_occupancy, WALK.time, WALK.truth.T[:2], 1.0, **keys)
     maps = []
     for count in spikes.T:
         tracking = np.repeat(np.column_stack([WALK.time, WALK.truth[:, :2]]), count, axis=0).T
         maps.append(_quietly(opexebo.analysis.rate_map, occupancy, tracking, 1.0, **keys))
-    return maps, occupancy
-
-
-def test_occupancy_and_maps_are_those_of_opexebo(sums: BinnedSums, theirs: tuple) -> None:
-    maps, occupancy = theirs
     assert_allclose(sums.seconds, occupancy.filled(0), atol=1e-9)
     assert_allclose(rate_map.rate_maps(sums, 0.0, 1e-3), [each.filled(np.nan) for each in maps], rtol=1e-9)
 
@@ -258,7 +210,6 @@ def test_separate_fields_are_those_of_opexebo(opexebo: ModuleType, spots: list[t
 
 
 def test_scores_agree_with_opexebo_and_pynapple(spikes: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of the figure of agreement."""
     _import("pynapple")
     cells = np.arange(spikes.shape[1])
     recording = sheet_recording(WALK, np.zeros(0, int))._replace(cell=cells, activity=spikes.astype(float))

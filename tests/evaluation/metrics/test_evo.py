@@ -1,7 +1,5 @@
 """ATE and RPE against evo's command line, where a user has it (GPL: a program of its own, never imported)."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The scorecard of a run: values, reasons for missing ones, maps in pieces, JSON and table."""
 
-from __future__ import annotations
-
 import json
 import re
 
@@ -40,33 +38,26 @@ def test_a_perfect_map_has_no_errors_and_odometry_has(circle):
         if name.startswith(("ate", "anytime", "rpe", "energy")):
             assert quantity.value == pytest.approx(0, abs=1e-6), name
             assert quantity.odometry is not None, name
-    assert card.quantities["ate_final"].odometry > 0.01
-    assert card.quantities["energy_all"].odometry > 0.01
+    assert min(card.quantities[name].odometry for name in ("ate_final", "energy_all")) > 0.01
     assert found["exm_arr"] == found["exm_arcr_strict"] == 1.0
     assert (found["exm_base"], found["path"]) == (36, pytest.approx(10.7))
-    assert card.quantities["energy_all"].note == f"{108 * 107 // 2} pairs"
-    assert card.quantities["energy_gap"].note == "k = 10; 98 pairs"
+    notes = [card.quantities[name].note for name in ("energy_all", "energy_gap")]
+    assert notes == [f"{108 * 107 // 2} pairs", "k = 10; 98 pairs"]
     (final,) = (line.split() for line in render_scorecard(card).splitlines() if "ATE, final" in line)
     assert (final[3], len(final)) == ("m", 5)
 
 
-def test_undefined_values_are_null_with_a_reason(circle):
+def test_undefined_values_are_null_with_a_reason_and_rows_without_truth_left_out(circle):
     blind = circle._replace(truth=None)
     card = score_run(blind, "no truth")
     assert Scorecard.model_validate(json.loads(card.model_dump_json())) == card
-    assert (card.quantities["ate_final"].value, card.quantities["ate_final"].note) == (
-        None,
-        "no ground truth",
-    )
-    assert values(card)["steps"] == 108
+    assert (values(card)["ate_final"], values(card)["steps"]) == (None, 108)
+    assert card.quantities["ate_final"].note == "no ground truth"
     assert all(quantity.value is not None or quantity.note for quantity in card.quantities.values())
     assert "no base set" in card.quantities["exm_arr"].note
     card = score_run(blind, exm=ExmConfig(base=36))
     assert values(card)["exm_arr"] == 1.0
     assert card.quantities["exm_arcr_strict"].note == "no ground truth"
-
-
-def test_rows_without_truth_are_left_out(circle):
     truth = circle.truth.copy()
     truth[::7] = np.nan
     card = score_run(circle._replace(truth=truth), exm=ExmConfig(base=36))
@@ -76,13 +67,13 @@ def test_rows_without_truth_are_left_out(circle):
     assert (found["exm_base"], found["exm_arcr_strict"]) == (30, 1.0)
 
 
-def test_a_run_without_places_or_without_a_loop_has_the_reason_as_note(circle):
+def test_without_places_or_a_loop_a_reason_is_noted_and_relations_are_scored_where_there_are_some(circle):
     nodes, links = np.zeros((0, 3)), np.zeros((0, 2), int)
     none = {"experience": np.full(108, -1), "created": np.zeros(0, int), "nodes": nodes, "links": links}
     card = score_run(circle._replace(**none))
     assert values(card)["exm_arr"] is None
-    assert card.quantities["exm_arr"].note == "no experiences"
-    assert card.quantities["energy_change"].note == "0 pairs"
+    notes = [card.quantities[name].note for name in ("exm_arr", "energy_change")]
+    assert notes == ["no experiences", "0 pairs"]
     assert values(card)["ate_final"] == pytest.approx(0, abs=1e-9)
     names = ("time", "truth", "online", "final", "odometry", "experience", "nodes")
     half = {name: getattr(circle, name)[:30] for name in names}
@@ -90,9 +81,6 @@ def test_a_run_without_places_or_without_a_loop_has_the_reason_as_note(circle):
     assert values(card)["exm_arcr_paper"] is None
     assert "never returns" in card.quantities["exm_arcr_paper"].note
     assert "as above" in render_scorecard(card)
-
-
-def test_relations_are_scored_where_there_are_some(circle):
     relations = Relations(np.array([101.0]), np.array([101.5]), np.array([[0.1, 0, 2 * np.pi / 36]]))
     card = score_run(circle, relations=relations)
     assert values(card)["relations_translation"] == pytest.approx(0, abs=1e-9)
@@ -100,30 +88,25 @@ def test_relations_are_scored_where_there_are_some(circle):
     assert "relations_translation" not in score_run(circle).quantities
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"final": np.zeros((3, 3))}, r"run\.final: shape \(3, 3\)"),
-        ({"online": np.full((108, 3), np.nan)}, r"run\.online: a NaN or infinite value"),
-        ({"experience": np.full(108, 36)}, r"run\.experience: 36 to 36; expected -1 to 35"),
-        ({"links": np.zeros(3, int)}, r"run\.links"),
-        ({"truth": np.zeros((3, 3))}, r"run\.truth"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"final": np.zeros((3, 3))}, r"run\.final: shape \(3, 3\)"),
+    ({"online": np.full((108, 3), np.nan)}, r"run\.online: a NaN or infinite value"),
+    ({"experience": np.full(108, 36)}, r"run\.experience: 36 to 36; expected -1 to 35"),
+    ({"links": np.zeros(3, int)}, r"run\.links"),
+    ({"truth": np.zeros((3, 3))}, r"run\.truth"),
+])  # fmt: skip
 def test_arrays_of_inconsistent_shapes_are_refused(circle, change, message):
     with pytest.raises(InputError, match=message):
         score_run(circle._replace(**change))
 
 
-class LastConfig(Settings):
-    row: int = -1
-
-
 def test_a_registered_metric_is_on_the_scorecard(circle, monkeypatch):
+    class LastConfig(Settings):
+        row: int = -1
+
     def last_x(config):
-        return Metric(
-            "my_last", "my last x", "m", "low", "Mine", lambda d: Finding(d.run.final[config.row, 0])
-        )
+        measure = lambda given: Finding(given.run.final[config.row, 0])  # noqa: E731
+        return Metric("my_last", "my last x", "m", "low", "Mine", measure)
 
     monkeypatch.setattr(METRICS, "_registered", {"last": MetricEntry(LastConfig, last_x)})
     (metric,) = build_metrics([PluginConfig(plugin="last", settings={"row": 3})])
@@ -143,7 +126,6 @@ def test_a_log_is_scored_in_all_modes(square):
     assert (found["exm_base"], found["exm_arr"], found["duration"]) == (32, 1.0, 95)
     rates = [found[f"exm_arcr_{mode}"] for mode in ("strict", "paper", "or", "literal")]
     assert rates == [0.9375, 0.875, 0.96875, 0]
-    assert "ARCR, strict" in render_scorecard(card)
 
 
 @pytest.fixture
@@ -158,9 +140,8 @@ def parted(circle):
     return circle._replace(final=final, nodes=nodes, piece=piece)
 
 
-def test_the_score_of_pieces_does_not_depend_on_where_they_lie(circle, parted):
-    whole = score_run(circle)
-    one = circle._replace(piece=np.zeros(len(circle.time), int))
+def test_the_score_of_pieces_does_not_depend_on_where_they_lie_and_each_is_aligned_by_itself(circle, parted):
+    whole, one = score_run(circle), circle._replace(piece=np.zeros(len(circle.time), int))
     assert score_run(one) == whole
     assert PIECES not in whole.lines()
     assert arrange_pieces(one) is one
@@ -171,6 +152,13 @@ def test_the_score_of_pieces_does_not_depend_on_where_they_lie(circle, parted):
         assert card[name].value == pytest.approx(near[name].value, abs=1e-9)
     assert card["ate_final"].value is card["energy_all"].value is None
     assert card["energy_all"].odometry == whole.quantities["energy_all"].odometry
+    noise = np.random.default_rng(0).normal(0, 0.01, circle.final.shape)
+    final, piece = compose(parted.final, noise), parted.piece
+    parts = [ate(final[piece == k], circle.truth[piece == k]) ** 2 * (piece == k).sum() for k in (0, 1)]
+    found = ate_within_pieces(final, circle.truth, piece)
+    assert found == pytest.approx(np.sqrt(sum(parts) / len(piece)))
+    assert found < ate(final, circle.truth)
+    assert ate_within_pieces(circle.final, circle.truth, 0 * piece) == ate(circle.final, circle.truth)
 
 
 def test_a_piece_that_was_tied_is_remarked_beside_errors_of_online_poses(circle):
@@ -211,25 +199,13 @@ def test_a_piece_that_is_tied_jumps_and_a_correction_within_a_piece_does_not(see
     assert jump(odometry[:at], odometry[:at]) is None
 
 
-def test_each_piece_is_aligned_by_itself(circle, parted):
-    noise = np.random.default_rng(0).normal(0, 0.01, circle.final.shape)
-    final, piece = compose(parted.final, noise), parted.piece
-    parts = [ate(final[piece == k], circle.truth[piece == k]) ** 2 * (piece == k).sum() for k in (0, 1)]
-    found = ate_within_pieces(final, circle.truth, piece)
-    assert found == pytest.approx(np.sqrt(sum(parts) / len(piece)))
-    assert found < ate(final, circle.truth)
-    assert ate_within_pieces(circle.final, circle.truth, 0 * piece) == ate(circle.final, circle.truth)
-
-
-def test_a_picture_shows_pieces_where_they_are_true(circle, parted):
+def test_a_picture_shows_pieces_where_they_are_true_or_side_by_side(circle, parted):
     shown, card = arrange_pieces(parted), score_run(parted)
     assert np.abs(shown.final[:, :2] - circle.final[:, :2]).max() < 1e-6  # in the frame of the largest piece
     draw_map(parted, card)  # draws nothing outside of its frame
     assert "2 pieces, 33% of the steps unjoined" in map_headline(card)
     assert "within the pieces of the map" in describe_score(card)
-
-
-def test_without_truth_a_picture_shows_pieces_side_by_side(parted):
+    # Without truth they lie side by side.
     shown = arrange_pieces(parted._replace(truth=None, online=parted.final))
     assert np.array_equal(shown.online, shown.final)  # online poses move with their pieces
     first, second = (shown.final[shown.piece == one] for one in (0, 1))
@@ -237,7 +213,7 @@ def test_without_truth_a_picture_shows_pieces_side_by_side(parted):
     for own, steps in ((first, parted.piece == 0), (second, parted.piece == 1)):
         before = parted.final[steps]
         assert np.allclose(between(own[:1], own)[:, :2], between(before[:1], before)[:, :2])
-    names = [label.get_text() for label in draw_map(parted, score_run(parted)).legends[0].get_texts()]
+    names = [label.get_text() for label in draw_map(parted, card).legends[0].get_texts()]
     assert f"piece 1, {int((parted.piece == 0).sum())} steps" in names
 
 

@@ -1,7 +1,5 @@
 """Alignment, ATE, RPE, online errors, energies, TUM files, and statistics of rates."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np
@@ -9,27 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.metrics.energy_metric import (
-    Relations,
-    energy,
-    energy_all_pairs,
-    read_relations,
-    relation_errors,
-)
+from evaluation.metrics import energy_metric, trajectory
+from evaluation.metrics.energy_metric import energy, energy_all_pairs
 from evaluation.metrics.run_metrics import energy_within_pieces, unjoined_share
 from evaluation.metrics.statistics import bootstrap, expected_calibration_error, wilson_interval
-from evaluation.metrics.trajectory import (
-    align,
-    ate,
-    interpolate,
-    online_errors,
-    position_errors,
-    read_tum,
-    rpe,
-    successive_pairs,
-    summarize_errors,
-    write_tum,
-)
+from evaluation.metrics.trajectory import ate, online_errors, read_tum, rpe, successive_pairs, write_tum
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose, wrap
 
@@ -57,7 +39,7 @@ def test_errors_do_not_depend_on_the_frames(pair, a, b):
     assert rpe(moved, other) == pytest.approx(rpe(estimate, truth), abs=1e-9)
     direct = energy(estimate, truth, every_pair(len(truth)))
     assert energy_all_pairs(moved, other) == pytest.approx(direct, rel=1e-9, abs=1e-9)
-    slow = [position_errors(estimate[:n], truth[:n])[-1] for n in range(1, len(truth) + 1)]
+    slow = [trajectory.position_errors(estimate[:n], truth[:n])[-1] for n in range(1, len(truth) + 1)]
     assert online_errors(moved, truth) == pytest.approx(np.array(slow), abs=1e-6)  # of the rows so far
 
 
@@ -66,7 +48,7 @@ def test_errors_do_not_depend_on_the_frames(pair, a, b):
 def test_a_rigid_motion_of_the_truth_is_no_error(pair, motion, step):
     truth, _ = pair
     moved = compose(motion, truth)
-    assert between(align(truth, moved), motion) == pytest.approx(np.zeros(3), abs=1e-9)
+    assert between(trajectory.align(truth, moved), motion) == pytest.approx(np.zeros(3), abs=1e-9)
     assert ate(truth, moved) == pytest.approx(0, abs=1e-9)
     assert energy_all_pairs(truth, moved)[:2] == pytest.approx((0, 0), abs=1e-10)
     if len(truth) > step:
@@ -74,10 +56,10 @@ def test_a_rigid_motion_of_the_truth_is_no_error(pair, motion, step):
         assert energy(truth, moved, pairs)[:2] == pytest.approx((0, 0), abs=1e-10)
 
 
-def test_errors_by_hand():
+def test_errors_by_hand_and_of_rotations_across_half_a_turn():
     line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     assert ate(2 * line, line) == pytest.approx(np.sqrt(2 / 3))  # alignment keeps the scale
-    assert position_errors(2 * line, line) == pytest.approx([1, 0, 1])
+    assert trajectory.position_errors(2 * line, line) == pytest.approx([1, 0, 1])
     assert ate(line[:1], line[1:2]) == 0
     for estimate, truth in ((line[:0], line[:0]), (line[:2], line)):
         with pytest.raises(InputError, match="the same number of rows"):
@@ -89,9 +71,6 @@ def test_errors_by_hand():
     assert np.isnan([one.total for one in none]).all()
     assert successive_pairs(5, 3).tolist() == [[0, 3], [1, 4]]
     assert successive_pairs(2, 3).shape == (0, 2)
-
-
-def test_rotations_are_compared_across_half_a_turn():
     truth, estimate = np.zeros((2, 2, 3))
     truth[:, 2], estimate[:, 2] = np.radians([179, -179]), np.radians([178, -177])
     assert np.degrees(rpe(estimate, truth)[1]) == pytest.approx(3)
@@ -101,6 +80,13 @@ def test_rotations_are_compared_across_half_a_turn():
     expected = np.mean(np.radians([2, 178, 180]) ** 2)
     assert energy(estimate, truth, every_pair(3)).rot2 == pytest.approx(expected)
     assert energy_all_pairs(estimate, truth).rot2 == pytest.approx(expected)
+    truth = np.array([[x, 0.0, 0.0] for x in range(5)])
+    online = truth.copy()
+    assert trajectory.summarize_errors(online_errors(online, truth)) == pytest.approx((0, 0, 0), abs=1e-9)
+    online[4, 0] = 9.0  # the last of five steps jumps 5 m ahead; the alignment makes up for a fifth
+    assert trajectory.summarize_errors(online_errors(online, truth)) == pytest.approx(
+        (0, 4 / 3**0.5, 4), abs=1e-9
+    )
 
 
 def test_all_pairs_of_a_long_run_need_no_memory():
@@ -131,40 +117,31 @@ def test_energy_within_pieces_is_of_their_pairs_wherever_they_lie(pair, count, s
     assert energy_within_pieces(estimate[:0], truth[:0], piece[:0]).pairs == 0
 
 
-def test_summary_of_online_errors():
-    truth = np.array([[x, 0.0, 0.0] for x in range(5)])
-    online = truth.copy()
-    assert summarize_errors(online_errors(online, truth)) == pytest.approx((0, 0, 0), abs=1e-9)
-    online[4, 0] = 9.0  # the last of five steps jumps 5 m ahead; the alignment makes up for a fifth
-    assert summarize_errors(online_errors(online, truth)) == pytest.approx((0, 4 / np.sqrt(3), 4), abs=1e-9)
-
-
-def test_headings_are_interpolated_along_the_shorter_arc():
+def test_headings_and_relations_are_interpolated_along_the_shorter_arc():
     time, pose = np.array([0.0, 1.0]), np.array([[0, 0, np.radians(170)], [1, 2, np.radians(-170)]])
-    found = interpolate(time, pose, np.array([-0.1, 0.0, 0.5, 0.75, 1.0, 1.1]))
+    found = trajectory.interpolate(time, pose, np.array([-0.1, 0.0, 0.5, 0.75, 1.0, 1.1]))
     assert np.isnan(found[[0, 5]]).all()
     assert found[2, :2] == pytest.approx([0.5, 1])
     assert np.degrees(wrap(found[1:5, 2] - np.radians(170))) == pytest.approx([0, 10, 15, 20])
     with pytest.raises(InputError, match=r"row 2: time 1\.0 after 1\.0"):
-        interpolate(np.array([0.0, 1, 1]), np.zeros((3, 3)), np.zeros(1))
-
-
-def test_relations_are_interpolated_and_those_outside_dropped():
+        trajectory.interpolate(np.array([0.0, 1, 1]), np.zeros((3, 3)), np.zeros(1))
     time = np.array([0.0, 1, 2])
     pose = np.array([[0, 0, np.radians(170)], [1, 0, np.radians(-170)], [2, 0, np.radians(-170)]])
     true = between(np.array([0.5, 0, np.pi]), np.array([1.5, 0, np.radians(-170)]))
     off = true + np.array([0.3, 0.4, np.radians(-6)])
-    relations = Relations(np.array([0.5, 0.5, 1.5]), np.array([1.5, 1.5, 2.5]), np.stack([true, off, true]))
-    assert relation_errors(time, pose, relations) == pytest.approx((0.25, 3.0, 2, 1))
+    relations = energy_metric.Relations(
+        np.array([0.5, 0.5, 1.5]), np.array([1.5, 1.5, 2.5]), np.stack([true, off, true])
+    )
+    assert energy_metric.relation_errors(time, pose, relations) == pytest.approx((0.25, 3.0, 2, 1))
     with pytest.raises(InputError, match="none inside the recording"):
-        relation_errors(time + 100, pose, relations)
+        energy_metric.relation_errors(time + 100, pose, relations)
 
 
 @pytest.mark.parametrize("head", ["", "t1,t2,x,y,z,roll,pitch,yaw\n"])
 def test_relations_file_with_and_without_a_header(tmp_path, head):
     path, row = tmp_path / "relations", "1.5 2.5 0.1 0.2 0 0 0 -1.5\n"
     path.write_text(head + (row.replace(" ", ",") if head else row) + "3 4 5")
-    found = read_relations(path)
+    found = energy_metric.read_relations(path)
     assert (found.start.tolist(), found.end.tolist()) == ([1.5], [2.5])
     assert found.motion.tolist() == [[0.1, 0.2, -1.5]]
 
@@ -213,7 +190,7 @@ def test_an_interval_holds_the_rate_and_mirrors_its_complement(count, runs):
         assert wilson_interval(*rate) == pytest.approx(interval, abs=1e-4)
 
 
-def test_probabilities_are_calibrated_where_they_equal_the_share_of_true():
+def test_calibration_and_bootstrap_of_known_values():
     half = np.full(20, 0.5)
     assert expected_calibration_error(half, np.arange(20) % 2 == 0) == 0.0
     assert expected_calibration_error(half, np.ones(20, bool)) == 0.5
@@ -222,9 +199,6 @@ def test_probabilities_are_calibrated_where_they_equal_the_share_of_true():
     assert expected_calibration_error(probability, random.random(20_000) < probability) < 0.02
     assert expected_calibration_error(probability, random.random(20_000) < probability**2) > 0.1
     assert np.isnan(expected_calibration_error(np.zeros(0), np.zeros(0, bool)))
-
-
-def test_bootstrap_is_fixed_by_seed_and_name():
     values = np.random.default_rng(1).normal(size=30)
     low, high = bootstrap(values, "a")
     assert (low, high) == bootstrap(values, "a")

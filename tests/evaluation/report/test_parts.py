@@ -1,7 +1,5 @@
 """The parts of the report: words, citations, files, closures and views, and what a page may run."""
 
-from __future__ import annotations
-
 import json
 import re
 from base64 import b64decode, b64encode
@@ -27,9 +25,8 @@ from tactile.base.se2 import compose
 ROOT = Path(__file__).parents[3]
 
 
-@pytest.mark.parametrize(
-    ("doubt", "level", "share"),
-    [
+def test_the_verdict_follows_the_doubt_and_an_unjudged_map_says_why() -> None:
+    for doubt, level, share in (
         (0.0, "believed", "100%"),
         (0.001, "believed", "over 99%"),
         (0.29, "believed", "71%"),
@@ -38,21 +35,15 @@ ROOT = Path(__file__).parents[3]
         (0.7, "uncertain", "70%"),
         (0.71, "doubted", "71%"),
         (np.nan, "unjudged", ""),
-    ],
-)
-def test_the_verdict_follows_the_doubt(doubt: float, level: str, share: str) -> None:
-    verdict = judge_map(doubt)
-    assert verdict.level == level
-    assert share in verdict.reason
-
-
-def test_an_unjudged_map_says_why() -> None:
+    ):
+        verdict = judge_map(doubt)
+        assert (verdict.level, share in verdict.reason) == (level, True)
     said = [judge_map(np.nan, why).reason for why in (NOT_JUDGED, UNFINISHED, "no loop closure was accepted")]
     assert len(set(said)) == 3
     assert "no loop closure was accepted".casefold() in said[2].casefold()
 
 
-def test_the_error_is_compared_with_odometry_in_words(circle) -> None:
+def test_the_error_is_compared_in_words_and_runs_are_drawn_in_the_frame_of_their_truth(circle) -> None:
     def words(**changes) -> str:
         return describe_score(score_run(circle._replace(**changes)))
 
@@ -61,13 +52,8 @@ def test_the_error_is_compared_with_odometry_in_words(circle) -> None:
     assert "worse than odometry" in words(final=circle.odometry * 2, odometry=circle.final * 1.001)
     assert "the same" in words(final=circle.odometry)
     assert "unknown" in words(truth=None)
-
-
-def test_compared_runs_are_drawn_in_the_frame_of_their_truth(circle) -> None:
     turned = circle._replace(final=compose(np.array([3.0, -2.0, 1.0]), circle.final))
-    runs = [
-        SimpleNamespace(name=name, layers=Layers.align(run)) for name, run in (("a", circle), ("b", turned))
-    ]
+    runs = [SimpleNamespace(name="a", layers=Layers.align(run)) for run in (circle, turned)]
     for trace in overlay_chart(runs).data:
         assert np.stack([trace.x, trace.y], axis=1) == pytest.approx(circle.truth[:, :2], abs=1e-5)
 
@@ -81,45 +67,30 @@ def test_half_the_resolution_keeps_the_brightness(image: np.ndarray) -> None:
     assert image.min() <= small.min() <= small.max() <= image.max()
 
 
-def test_dim_views_are_brightened_and_full_ones_are_not() -> None:
+def test_dim_views_are_brightened_and_many_reduced_to_fit_the_page() -> None:
     full = np.arange(256, dtype=np.uint8).repeat(4).reshape(2, 8, 64)
     dim = full // 3
     for view, gain in ((full, 255 / 253), (dim, 255 / 84), (np.zeros_like(full), 1.0)):
         record = view_records(ClosureViews(np.array([3, 7]), view))
-        assert record is not None
         assert record["gain"] == pytest.approx(gain, rel=0.01)
         shown = np.frombuffer(b64decode(record["pixels"]), np.uint8).reshape(view.shape)
         assert (shown == 0).tolist() == (view == 0).tolist()
         assert shown.max() == (255 if view.any() else 0)
-
-
-def test_views_are_reduced_only_to_fit_the_page() -> None:
-    rng = np.random.default_rng(0)
-    small = ClosureViews(np.array([3, 7]), rng.integers(0, 256, (2, 3, 6), np.uint8))
-    record = view_records(small)
-    assert record is not None
-    assert (record["rows"], record["columns"], record["steps"]) == (3, 6, [3, 7])
-    assert len(b64decode(record["pixels"])) == small.view.size
-    many = ClosureViews(np.arange(10_000), np.zeros((10_000, 20, 60), np.uint8))
-    record = view_records(many)
-    assert record is not None
+        assert (record["rows"], record["columns"], record["steps"]) == (8, 64, [3, 7])
+    record = view_records(ClosureViews(np.arange(10_000), np.zeros((10_000, 20, 60), np.uint8)))
     assert VIEW_BYTES / 2 < len(b64decode(record["pixels"])) == 10_000 * 10 * 15 < VIEW_BYTES
     assert view_records(None) is None
 
 
 def test_closures_come_with_their_evidence(tmp_path: Path, circle) -> None:
-    text = (
-        "step,match_step,verdict,keyframe,posterior,odd\n36,0,accepted,9,0.123456789,inf\n20,3,open,5,1,nan\n"
-    )
-    (tmp_path / "closures.csv").write_text(text)
+    rows = "36,0,accepted,9,0.123456789,inf\n20,3,open,5,1,nan\n"
+    (tmp_path / "closures.csv").write_text(f"step,match_step,verdict,keyframe,posterior,odd\n{rows}")
     table = read_closure_table(tmp_path)
     assert table.steps.tolist() == [[0, 36], [3, 20]]
     record = closure_records(table, circle)
     assert record["verdicts"] == ["accepted", "not accepted"]
-    assert [(each["name"], each["values"]) for each in record["evidence"]] == [
-        ("posterior", [0.12346, 1.0]),
-        ("odd", ["inf", None]),
-    ]
+    evidence = {each["name"]: each["values"] for each in record["evidence"]}
+    assert evidence == {"posterior": [0.12346, 1.0], "odd": ["inf", None]}
     assert record["apart"][0] == pytest.approx(np.hypot(*(circle.truth[0] - circle.truth[36])[:2]), rel=1e-4)
     assert record["times"][1] == [1.5, 10.0]
     earlier = closure_records(ClosureTable(np.array([[-5, 7]]), ["accepted"], {}), circle)
@@ -138,6 +109,5 @@ def test_no_text_ends_the_data_of_a_page(value: object) -> None:
 def test_the_policy_allows_these_scripts_and_no_others() -> None:
     policy = content_policy(["alert('π')"])
     digest = b64encode(sha256("alert('π')".encode()).digest()).decode()
-    assert policy == (
-        f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data: blob:"
-    )
+    scripts = f"default-src 'none'; script-src 'sha256-{digest}'; "
+    assert policy == scripts + "style-src 'unsafe-inline'; img-src data: blob:"

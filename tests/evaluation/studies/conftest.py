@@ -1,13 +1,11 @@
 """Studies of short sessions, and runs without sessions."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import jax
@@ -34,10 +32,8 @@ TINY = {
 def start(*arguments: object) -> subprocess.Popen[str]:
     """The program in a process group of its own; it heeds the interrupts that background programs ignore."""
     code = (
-        "import signal, sys\n"
-        "from ratslam.__main__ import main\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "sys.exit(main(sys.argv[1:]))\n"
+        "import signal, sys; from ratslam.__main__ import main; "
+        "signal.signal(signal.SIGINT, signal.default_int_handler); sys.exit(main(sys.argv[1:]))"
     )
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)], cwd=ROOT, stdout=subprocess.PIPE,
@@ -45,8 +41,12 @@ def start(*arguments: object) -> subprocess.Popen[str]:
     )  # fmt: skip
 
 
+def preset(name: str, config: Path, assignments: Iterable[str], output: Path) -> list[str]:
+    given = [part for each in assignments for part in ("--set", each)]
+    return ["study", "--preset", name, str(config), *given, "-o", str(output)]
+
+
 def wait_until(ready: Callable[[], object], process: subprocess.Popen[str]) -> None:
-    """Waits until a running program has come so far."""
     end = time.monotonic() + PATIENCE
     while not ready():
         assert process.poll() is None, process.communicate()
@@ -62,9 +62,8 @@ def kill(process: subprocess.Popen[str], number: int) -> tuple[str, str]:
 
 def record(row="", seed=0, time=100.0, error=None, varied=None, odometry=None, hash=None, **values):
     """A record without a run."""
-    quantities = {
-        name: Quantity(label=name, value=value, unit="", odometry=odometry) for name, value in values.items()
-    }
+    told = {"unit": "", "odometry": odometry}
+    quantities = {name: Quantity(label=name, value=value, **told) for name, value in values.items()}
     measured = {"step_time": time, "step_time_p99": 2 * time, "run_time": 3 * time, "compile_time": 1.0}
     return RunRecord(
         hash=hash or row or "none", seed=seed, row=row, varied=varied or {}, steps=10, quantities=quantities,
@@ -82,8 +81,6 @@ def shared_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def tiny(tmp_path: Path) -> Callable[..., Path]:
-    """Writes a study of tiny sessions."""
-
     def write(**content: object) -> Path:
         (tmp_path / "base.yaml").write_text("simulation: {}\n")
         path = tmp_path / "study.yaml"
@@ -102,13 +99,12 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def run_job(job: Job) -> RunRecord:
         keys.append(job.key)
         score = job.config.keyframes.min_score
-        failed = "keyframes.min_score: too much" if score > 40 else None
-        values = {
-            "energy_all": (score - 7) ** 2 + job.seed,
-            "exm_arr": 1 / (1 + abs(score - 12) + job.config.recall.guard),
-        }
-        found = record(time=1000 / score, error=failed, **({} if failed else values))
-        return found.model_copy(update={"hash": job.hash, "seed": job.seed, "copy_number": job.copy_number})
+        values = {"error": "keyframes.min_score: too much"}
+        if score <= 40:
+            arr = 1 / (1 + abs(score - 12) + job.config.recall.guard)
+            values = {"energy_all": (score - 7) ** 2 + job.seed, "exm_arr": arr}
+        found = record(time=1000 / score, seed=job.seed, hash=job.hash, **values)
+        return found.model_copy(update={"copy_number": job.copy_number})
 
     monkeypatch.setattr("evaluation.studies.run_job.run_job", run_job)
     return keys

@@ -1,7 +1,5 @@
 """Studies of many networks: equal networks one by one, equal bytes however they are computed, errors."""
 
-from __future__ import annotations
-
 import csv
 import signal
 from pathlib import Path
@@ -24,7 +22,7 @@ from ratslam.runs.build_session import build_session, open_observations, read_ob
 from ratslam.runs.settings.run_config import load_config
 from tactile.base.errors import InputError
 from tactile.base.types import Odometry
-from tests.evaluation.studies.conftest import kill, start, wait_until
+from tests.evaluation.studies.conftest import kill, preset, start, wait_until
 
 SMALL = ["sets=4", "steps=100", "chunk=2", "bins=5", "pose_cells.cells_xy=11", "pose_cells.cells_heading=12"]
 STILL = {"truth": np.zeros((200, 3)), "in_v": np.zeros(200), "in_w": np.zeros(200)}
@@ -59,8 +57,7 @@ def chunks(folder: Path) -> dict[str, bytes]:
 
 
 def command(path: Path, assignments: list[str], output: Path) -> list[str]:
-    given = [part for each in assignments for part in ("--set", each)]
-    return ["study", "--preset", "cells", str(path), *given, "--workers", "1", "-o", str(output)]
+    return [*preset("cells", path, assignments, output), "--workers", "1"]
 
 
 def test_without_noise_the_packet_follows_the_truth(box, tmp_path):
@@ -69,9 +66,8 @@ def test_without_noise_the_packet_follows_the_truth(box, tmp_path):
     study = cell_study(box(), ["steps=200", "sets=1", "precision=float64", *fixed])
     with Executor(1) as executor:
         scores = run_cell_study(study, tmp_path / "out", executor)
-    assert scores["drift"][0] < 0.02  # a fifth of a cell
+    assert scores["decoding"][0] <= scores["drift"][0] < 0.02  # a fifth of a cell
     assert scores["drift_heading"][0] < 0.05
-    assert scores["decoding"][0] <= scores["drift"][0]
     assert not scores["reseeded"].any()
     visited = np.bincount(study.course.bin, study.course.seconds, 400).reshape(20, 20) > 0
     assert (np.isfinite(scores["maps"][0]) == visited).all()
@@ -87,8 +83,7 @@ def test_a_course_starts_in_the_middle_of_the_torus_and_every_position_lies_in_i
     assert np.allclose(expected_poses(course.config, truth + [3.0, -2.0, 0.0]), course.expected)
     row, column = np.divmod(course.bin, 7)
     for edges, at, values in ((course.x_edges, column, truth[:, 0]), (course.y_edges, row, truth[:, 1])):
-        assert (values >= edges[at] - 1e-12).all()
-        assert (values <= edges[at + 1] + 1e-12).all()
+        assert (np.clip(values, edges[at] - 1e-12, edges[at + 1] + 1e-12) == values).all()
 
 
 @pytest.mark.soak
@@ -136,27 +131,18 @@ def test_the_program_writes_table_maps_and_pictures(box, tmp_path, capsys):
     output = tmp_path / "out"
     assert main(command(box(), [*SMALL, "views=true"], output)) == 0
     assert (output / "table.md").read_text().strip() in capsys.readouterr().out
-    with (output / "table.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader((output / "table.csv").read_text().splitlines()))
     assert [int(row["set"]) for row in rows] == [0, 1, 2, 3]
     assert all(float(row["drift"]) > 0 for row in rows)
     with np.load(output / "maps.npz") as maps:
         assert maps["maps"].shape == (4, 8, 5, 5)
-    for name in ("drift.png", "decoding.png", "maps.png"):
-        assert (output / name).read_bytes().startswith(b"\x89PNG")
+    assert {path.name for path in output.glob("*.png")} >= {"drift.png", "decoding.png", "maps.png"}
 
 
 @pytest.mark.soak
-def test_bytes_do_not_depend_on_workers(box, tmp_path):
-    for workers in (1, 2):
-        with Executor(workers) as executor:
-            run_cell_study(cell_study(box(), SMALL), tmp_path / f"{workers}", executor)
-    assert chunks(tmp_path / "2") == chunks(tmp_path / "1")
-
-
-@pytest.mark.soak
-def test_a_killed_study_continues_with_the_same_bytes(box, tmp_path):
+def test_a_killed_study_continues_with_the_same_bytes_with_another_number_of_workers(box, tmp_path):
     whole, cut = (command(box(), [*SMALL, "sets=40"], tmp_path / name) for name in ("whole", "cut"))
+    whole[-1] = "2"
     assert main(whole) == 0
     process = start(*cut)
     wait_until(lambda: (tmp_path / "cut" / FOLDER).exists() and chunks(tmp_path / "cut"), process)
@@ -166,20 +152,17 @@ def test_a_killed_study_continues_with_the_same_bytes(box, tmp_path):
     assert chunks(tmp_path / "whole").items() <= chunks(tmp_path / "cut").items()
 
 
-@pytest.mark.parametrize(
-    ("changed", "more", "named"),
-    [
-        ({}, ["sett=3"], "sett"),
-        ({}, ["excite_sigma=[1.2, 0.8]"], "excite_sigma"),
-        ({}, ["excite_sigma=[0.0, 0.8]"], "excite_sigma"),
-        ({}, ["chosen=[15876]"], "15876"),
-        ({}, ["pose_cells.cell_size=0.001"], "torus"),
-        ({"truth": None}, [], "no true poses"),
-        ({"truth": np.where(np.arange(200)[:, None] == 17, np.nan, np.ones(3))}, [], "17"),
-        ({"in_flags": np.full(200, 2)}, ["views=true"], "no views"),
-        (STILL, [], "stays in one place"),
-    ],
-)
+@pytest.mark.parametrize(("changed", "more", "named"), [
+    ({}, ["sett=3"], "sett"),
+    ({}, ["excite_sigma=[1.2, 0.8]"], "excite_sigma"),
+    ({}, ["excite_sigma=[0.0, 0.8]"], "excite_sigma"),
+    ({}, ["chosen=[15876]"], "15876"),
+    ({}, ["pose_cells.cell_size=0.001"], "torus"),
+    ({"truth": None}, [], "no true poses"),
+    ({"truth": np.where(np.arange(200)[:, None] == 17, np.nan, np.ones(3))}, [], "17"),
+    ({"in_flags": np.full(200, 2)}, ["views=true"], "no views"),
+    (STILL, [], "stays in one place"),
+])  # fmt: skip
 def test_unfit_settings_and_sessions_are_refused(box, changed, more, named):
     with pytest.raises(InputError, match=named):
         cell_study(box(**changed), more)
@@ -253,14 +236,12 @@ def test_networks_equal_those_simulated_one_by_one(views):
 
 
 def test_networks_that_left_the_smallest_window_go_back_to_it():
-    motion = np.tile([0.02, 0.0, 0.01], (12 * SEGMENT, 1))
-    steps = len(motion)
-    template, energy = np.zeros(steps, np.int32), np.zeros(steps)
-    novel = np.arange(steps) == 0
-    template[-1] = 1  # as many as in `course`, so that nothing compiles again
-    energy[200] = 0.05
-    given = CellCourse(motion, np.zeros((steps, 2)), template, novel, np.zeros(steps), energy)
+    steps = np.arange(12 * SEGMENT)
+    motion = np.tile([0.02, 0.0, 0.01], (len(steps), 1))
+    template = (steps == steps[-1]).astype(np.int32)  # as many as in `course`, so that nothing compiles again
+    energy, still = 0.05 * (steps == 200), np.zeros(len(steps))
+    given = CellCourse(motion, np.zeros((len(steps), 2)), template, steps == 0, still, energy)
     level = np.concatenate([track.level for track in walk(CONFIG, sets(), given, CHOSEN, block=2)], axis=1)
-    assert (level[:, 200] > 0).all()
+    assert level[:, 200].all()
     assert not level[:, :200].any()
     assert not level[:, -SEGMENT:].any()

@@ -1,8 +1,6 @@
-"""Settings for a scene, the cheaper steps that are tried, and presets: studies made from a configuration."""
+"""Studies made from a configuration: settings for a scene, cheaper steps, presets, and growth."""
 
-from __future__ import annotations
-
-import json
+import signal
 from itertools import islice
 
 import numpy as np
@@ -13,7 +11,8 @@ from hypothesis import strategies as st
 from evaluation.metrics.metric import Quantity
 from evaluation.studies import recommendation
 from evaluation.studies.commands import PRESETS
-from evaluation.studies.presets import METHODS, PARTICLES, PARTS, TIERS, preset_study, variations
+from evaluation.studies.growth import FILE, growth_study, measure_growth, read_rows
+from evaluation.studies.presets import PARTICLES, PARTS, preset_study, variations
 from evaluation.studies.run_job import RunLog, RunRecord
 from evaluation.studies.scene_statistics import Scene, scene_of, short_session, shortened, with_tier
 from evaluation.studies.study import with_settings
@@ -23,8 +22,10 @@ from ratslam.grid.particles import LAYERS
 from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import load, override, parse, validate
+from robot.simulation.head.simulated_session import HeadSimulation
+from robot.world.maze import CELL_SIDE
 from tactile.base.errors import InputError
-from tests.evaluation.studies.conftest import ROOT
+from tests.evaluation.studies.conftest import ROOT, kill, preset, start, wait_until
 
 GOLDEN = ROOT / "tests" / "golden"
 LENGTHS = st.floats(1e-3, 1e3)
@@ -146,7 +147,6 @@ def test_a_session_is_cut_to_about_so_many_cycles(tmp_path):
 
 @pytest.fixture
 def stubbed(monkeypatch):
-    """Replaces sessions; returns the configurations that would be run."""
     configurations: list[RunConfig] = []
 
     def run_job(job):
@@ -161,10 +161,8 @@ def stubbed(monkeypatch):
 
 
 def test_every_step_is_tried_on_the_same_short_session(tmp_path, capsys, stubbed):
-    path = tmp_path / "maze.yaml"
-    path.write_text(
-        "simulation: {fidelity: dynamic}\npose_cells: {cell_size: 0.005}\nattractor: {engine: dense}\n"
-    )
+    path, cells = tmp_path / "maze.yaml", "pose_cells: {cell_size: 0.005}\nattractor: {engine: dense}\n"
+    path.write_text(f"simulation: {{fidelity: dynamic}}\n{cells}")
     assert main(["size", str(path), "--cycles", "400"]) == 0
     output = capsys.readouterr().out
     first, second, *others = stubbed
@@ -173,24 +171,18 @@ def test_every_step_is_tried_on_the_same_short_session(tmp_path, capsys, stubbed
     assert second.simulation.fidelity == "dynamic"
     assert {config.simulation.path.circuits for config in stubbed} == {first.simulation.path.circuits}
     assert len(first.simulation.path.circuits) < 10
-    assert "classic" in [config.backend for config in others]
-    assert "float32" in [config.session.precision for config in others]
+    assert {"classic", "float32"} <= {one for c in others for one in (c.backend, c.session.precision)}
     assert "backend: cannot be had" in output  # and the rest is printed
-    pasted = output.partition("For maze.yaml:")[2]
-    changed = validate(parse(pasted, "a"), RunConfig)
-    assert (changed.pose_cells, changed.simulation.fidelity) == (
-        first.pose_cells.model_copy(update={"cells_xy": changed.pose_cells.cells_xy}), "kinematic",
-    )  # fmt: skip
+    changed = validate(parse(output.partition("For maze.yaml:")[2], "a"), RunConfig)
+    cells = first.pose_cells.model_copy(update={"cells_xy": changed.pose_cells.cells_xy})
+    assert (changed.pose_cells, changed.simulation.fidelity) == (cells, "kinematic")
 
 
-@pytest.mark.parametrize(
-    ("content", "arguments", "named"),
-    [
-        ("simulation: {}\n", ["--cycles", "3"], "--cycles"),
-        (f"recording: {{file: {GOLDEN}/a_square3.npz}}\nbackend: grid\n", [], "without whiskers"),
-        ("recording: {file: still.csv, table: {pose: {}}}\n", [], "never moves"),
-    ],
-)
+@pytest.mark.parametrize(("content", "arguments", "named"), [
+    ("simulation: {}\n", ["--cycles", "3"], "--cycles"),
+    (f"recording: {{file: {GOLDEN}/a_square3.npz}}\nbackend: grid\n", [], "without whiskers"),
+    ("recording: {file: still.csv, table: {pose: {}}}\n", [], "never moves"),
+])  # fmt: skip
 def test_unfit_input_is_one_clear_error(content, arguments, named, tmp_path, capsys):
     (tmp_path / "config.yaml").write_text(content)
     rows = "".join(f"{k},0,0,0\n" for k in range(99))
@@ -202,12 +194,7 @@ def test_unfit_input_is_one_clear_error(content, arguments, named, tmp_path, cap
 
 
 SQUARE, MAZE = ROOT / "configs" / "square.yaml", ROOT / "configs" / "whisker_maze.yaml"
-CELLS = "pose_cells: {cells_xy: 11, cells_heading: 12}\n"
-SMALL = (
-    "simulation: {maze: {columns: 3, rows: 2, loop: 6}, path: {circuits: C}, whisking: {rate: 0.5}}\n"
-    f"{CELLS}backend: classic\n"
-)
-TINY = "simulation: {maze: {columns: 2, rows: 2, loop: 4}, path: {circuits: CC}, raw: true}\n" + CELLS
+SMALL = "simulation: {maze: {columns: 3, rows: 2, loop: 6}, path: {circuits: CA}, whisking: {rate: 0.5}}\n"
 
 
 @pytest.mark.parametrize("name", sorted(set(PRESETS) - {"tiers", "growth", "cells"}))
@@ -219,7 +206,7 @@ def test_a_preset_keeps_the_seed_of_the_configuration_and_takes_overrides(name):
     assert guards == ({2, 3, 4} if name == "vary" else {3})
 
 
-def test_rows_turn_parts_off_or_take_other_backends():
+def test_rows_turn_parts_off_take_other_backends_or_vary_every_number_within_its_limits():
     study, _ = preset_study("ablate", SQUARE, ["copies=3"])
     assert list(dict.fromkeys(job.row for job in study.jobs)) == list(PARTS)
     assert len({job.key for job in study.jobs}) == len(study.jobs) == 3 * len(PARTS)
@@ -227,14 +214,9 @@ def test_rows_turn_parts_off_or_take_other_backends():
         study, _ = preset_study("backends", base)
         assert [job.config.backend for job in study.jobs] == ["recall", "grid"]
     study, _ = preset_study("pareto", MAZE)
-    grids = [
-        job.config.grid.particles for job in study.jobs if job.config.backend == "grid" and job.seed == 0
-    ]
-    assert grids == list(PARTICLES)
+    grids = [job.config for job in study.jobs if job.config.backend == "grid" and job.seed == 0]
+    assert [config.grid.particles for config in grids] == list(PARTICLES)
     assert study.jobs[-1].config.simulation.fidelity == "quasistatic"
-
-
-def test_every_number_is_varied_in_both_directions_within_its_limits():
     found = variations(override(load(SQUARE), ["recall.local=0.9"]), 0.2)
     names = [name for name, _ in found]
     for name in ("recall.excite", "keyframes.min_score", "keyframes.noise.per_cell"):
@@ -246,44 +228,23 @@ def test_every_number_is_varied_in_both_directions_within_its_limits():
 
 
 def test_perturbed_copies_are_run_beside_the_session(tmp_path, capsys):
-    (tmp_path / "c.yaml").write_text(SMALL)
-    command = ["study", "--preset", "spread", str(tmp_path / "c.yaml"), "--set", "copies=2"]
-    assert main([*command, "-o", str(tmp_path / "out"), "--workers", "1"]) == 0
+    cells = "pose_cells: {cells_xy: 11, cells_heading: 12}\nbackend: classic\n"
+    (tmp_path / "c.yaml").write_text(SMALL + cells)
+    command = preset("spread", tmp_path / "c.yaml", ["copies=2"], tmp_path / "out")
+    assert main([*command, "--workers", "1"]) == 0
     rows = [line.split("|")[1].strip() for line in capsys.readouterr().out.splitlines()[2:5]]
     assert rows == ["as recorded", "perturbed", "dead reckoning"]
     assert [each.copy_number for each in RunLog(tmp_path / "out").records.values()] == [0, 1, 2]
 
 
-@pytest.mark.soak
-def test_tiers_are_compared_by_cost_and_images(tmp_path, capsys, monkeypatch):
-    monkeypatch.delitem(METHODS, "recall")  # one kernel less to compile
-    (tmp_path / "tiny.yaml").write_text(TINY)
-    command = ["study", "--preset", "tiers", str(tmp_path / "tiny.yaml"), "--seconds", "60"]
-    assert main([*command, "-o", str(tmp_path / "out"), "--workers", "1"]) == 0
-    rows = json.loads((tmp_path / "out" / "table.json").read_text())["rows"]
-    assert [row["row"] for row in rows] == [f"{name}, classic" for name in TIERS]
-    cost, contact, height = (
-        [row["spreads"][name]["median"] for row in rows]
-        for name in ("simulation_time", "contact_difference", "height_difference")
-    )
-    assert cost[0] < min(cost[1:]) / 3
-    assert contact[2] == height[2] == 0
-    assert 0 < height[0] < 5
-    assert contact[0] < 0.04
-    assert "auto takes quasistatic" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("name", "path", "overrides", "options", "named"),
-    [
-        ("tiers", "recorded.yaml", [], {}, "a scene to simulate"),
-        ("tiers", "recorded.yaml", [], {"seconds": 0}, "--seconds"),
-        ("ablate", SQUARE, ["recall.reach=-1"], {}, "recall.reach"),
-        ("spread", "none.yaml", [], {}, "none.yaml"),
-        ("vary", SQUARE, [], {"by": 0}, "--by"),
-        ("vary", SQUARE, [], {"by": 1.0}, "--by"),
-    ],
-)
+@pytest.mark.parametrize(("name", "path", "overrides", "options", "named"), [
+    ("tiers", "recorded.yaml", [], {}, "a scene to simulate"),
+    ("tiers", "recorded.yaml", [], {"seconds": 0}, "--seconds"),
+    ("ablate", SQUARE, ["recall.reach=-1"], {}, "recall.reach"),
+    ("spread", "none.yaml", [], {}, "none.yaml"),
+    ("vary", SQUARE, [], {"by": 0}, "--by"),
+    ("vary", SQUARE, [], {"by": 1.0}, "--by"),
+])  # fmt: skip
 def test_unfit_configurations_are_refused(tmp_path, name, path, overrides, options, named):
     (tmp_path / "recorded.yaml").write_text("recording: {file: a.npz}\n")
     with pytest.raises(InputError, match=named):
@@ -302,3 +263,95 @@ def test_sessions_are_shortened_to_whole_laps_or_to_a_time():
     assert path(1e9, circuits=whole).circuits == whole
     assert len(path(1.0, circuits=whole).circuits) == 2
     assert [path(100.0, explore=time).explore for time in (500.0, 50.0)] == [100, 50]
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text(SMALL)
+    return path
+
+
+def errors(row):
+    """The fields of a row that no clock decides."""
+    names = "steps keyframes closures energy ate energy_odometry energy_final ate_final"
+    return [getattr(row, name) for name in names.split()]
+
+
+def test_lengths_double_up_to_the_greatest_and_the_course_of_a_recording_is_known_ground():
+    for ground, expected in ((100_000, [*(400 * 2**k for k in range(8)), 100_000]), (100, [100])):
+        _, ((_, _, lengths, _),) = growth_study(SQUARE, ["first=400", f"known_ground={ground}"])
+        assert lengths == expected
+    _, (task,) = growth_study(SQUARE, ["first=150", "known_ground=300", "window=40"])
+    assert (task.ground, task.lengths, task.window) == ("known ground", [150, 300], 40)
+    done: list[int] = []
+    rows = list(measure_growth(task, lambda: done.append(1)))
+    assert ([row.steps for row in rows], len(done)) == ([150, 300], 300)
+    assert 0 < rows[0].closures < rows[1].closures
+    assert rows[1].median <= rows[1].largest
+
+
+def test_known_ground_repeats_its_laps_and_new_ground_enters_no_cell_twice(config):
+    _, tasks = growth_study(config, ["first=100", "known_ground=300", "new_ground=300", "simulation.seed=3"])
+    known, new = (HeadSimulation(task.config.simulation) for task in tasks)
+    for session in known, new:
+        assert 300 <= session.length < 500  # no more than it needs
+        assert session.config.seed == 3
+    cells = [np.floor(session.truth[:, :2] / CELL_SIDE).astype(int) for session in (known, new)]
+    assert len(np.unique(cells[0], axis=0)) == 6
+    entered = cells[1][np.r_[True, (np.diff(cells[1], axis=0) != 0).any(axis=1)]]
+    assert len(entered) > 60
+    # a head that turns at the border of two cells may return to the first for a moment
+    assert len(np.unique(entered, axis=0)) > 0.9 * len(entered)
+
+
+def test_a_measurement_on_the_way_changes_nothing(config):
+    _, tasks = growth_study(config, ["first=32", "known_ground=96", "new_ground=0"])
+    rows = list(measure_growth(tasks[0]))
+    assert [row.steps for row in rows] == [32, 64, 96]
+    for row in rows:
+        assert 0 < row.keyframes <= row.steps
+        assert 0 < row.median <= row.p99 <= row.largest
+        assert row.mean <= row.process_mean
+        assert row.memory > 50
+        assert row.false_closures <= row.closures
+        assert min(row.energy_odometry, row.energy, row.ate, row.energy_final, row.ate_final, row.end) > 0
+    (alone,) = measure_growth(tasks[0]._replace(lengths=[96]))
+    assert errors(alone) == errors(rows[-1])
+
+
+@pytest.mark.soak
+def test_an_interrupt_leaves_table_and_picture_of_the_rows_so_far(config, tmp_path):
+    output = tmp_path / "out"
+    process = start(*preset("growth", config, ["first=32", "known_ground=600", "new_ground=0"], output))
+    wait_until(lambda: len(read_rows(output)) >= 2, process)
+    text, _ = kill(process, signal.SIGINT)
+    assert process.returncode == 130
+    rows = read_rows(output)
+    assert [(row.ground, row.steps) for row in rows[:2]] == [("known ground", 32), ("known ground", 64)]
+    assert (output / "table.md").read_text().strip() in text
+    assert len((output / "table.csv").read_text().splitlines()) == len(rows) + 1
+    assert (output / "growth.png").exists()
+    with (output / FILE).open("a") as file:
+        file.write('{"ground": "known gr')  # what a kill leaves
+    assert read_rows(output) == rows
+
+
+@pytest.mark.parametrize(("settings", "named"), [
+    (["known_grounds=3"], "known_grounds"),
+    (["known_ground=-3"], "known_ground"),
+    (["new_ground=90000"], "at most"),
+    (["known_ground=0", "new_ground=0"], "no session"),
+    (["recall.reach=-1"], "recall.reach"),
+    (["simulation.maze.kind=tree"], "a maze without loops"),
+])  # fmt: skip
+def test_unfit_settings_are_refused(config, settings, named):
+    with pytest.raises(InputError, match=named):
+        growth_study(config, settings)
+
+
+@pytest.mark.parametrize("option", [["--workers", "2"], ["--search"]])
+def test_options_of_other_studies_are_refused_before_anything_runs(config, tmp_path, capsys, option):
+    assert main([*preset("growth", config, [], tmp_path / "out"), *option]) == 2
+    assert option[0] in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

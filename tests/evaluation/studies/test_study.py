@@ -1,20 +1,26 @@
-"""Studies: jobs of a file, none lost or repeated, and refused files."""
+"""Studies: jobs of a file, none lost or repeated, refused files, and the tables of their reports."""
 
-from __future__ import annotations
-
+import csv
 import json
+import statistics
 from math import prod
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evaluation.metrics.run_metrics import recognition_error
+from evaluation.metrics.statistics import pareto_optimal
+from evaluation.studies.metrics import find_error
 from evaluation.studies.study import Study, StudyPlan, read_study
+from evaluation.studies.study_report import label, make_report, render, save_report, spread
 from ratslam.cli import main
 from ratslam.mapping.config import FULL, KeyframeMapConfig
 from ratslam.runs.settings.run_config import RunConfig
 from tactile.base.errors import InputError
+from tests.evaluation.studies.conftest import record
 
 ROOT = Path(__file__).parents[3]
 MAZE = ROOT / "configs" / "whisker_maze.yaml"
@@ -27,10 +33,9 @@ AXES = {
     "simulation.whisking.rate": st.floats(0.5, 4),
     "places": st.sampled_from([{}, {"radius": 1.0}, {"radius": 1.5}]),
 }
+AXIS = {key: st.lists(values, min_size=1, max_size=3, unique_by=json.dumps) for key, values in AXES.items()}
 GRIDS = st.lists(st.sampled_from(sorted(AXES)), unique=True, max_size=3).flatmap(
-    lambda keys: st.fixed_dictionaries(
-        {key: st.lists(AXES[key], min_size=1, max_size=3, unique_by=json.dumps) for key in keys}
-    )
+    lambda keys: st.fixed_dictionaries({key: AXIS[key] for key in keys})
 )
 
 
@@ -72,7 +77,7 @@ def test_hashes_follow_from_settings_and_not_from_notation(folder, grid, data):
     assert {job.key for job in as_row} == {job.key for job in as_set} <= expected
 
 
-def test_equal_rows_are_one_job_and_explicit_defaults_another(folder):
+def test_equal_rows_are_one_job_explicit_defaults_another_and_sections_are_set_before_keys(folder):
     """A default that is given is another run: others are completed from the source."""
     usual = KeyframeMapConfig().min_score
     rows = {"a": None, "b": {}, "c": {"keyframes.min_score": usual}}
@@ -80,15 +85,18 @@ def test_equal_rows_are_one_job_and_explicit_defaults_another(folder):
     assert [job.row for job in (a, b, c)] == list(rows)
     assert a.config == c.config
     assert a.key == b.key != c.key
+    written = {"keyframes.min_score": 2.0, "keyframes": {"max_distance": 9.0}}
+    found = [read(folder, set=dict(items)).jobs for items in (written.items(), reversed(written.items()))]
+    assert found[0] == found[1]
+    assert found[0][0].config.keyframes.min_score == 2.0
 
 
-@pytest.mark.parametrize(
-    ("base", "section"),
-    [("whisker_maze", "simulation"), ("create_arena", "create_simulation"), ("square", "session")],
-)
-def test_seeds_belong_to_the_simulation_or_the_session(folder, base, section):
-    found = read(folder, base=ROOT / "configs" / f"{base}.yaml", seeds=[3, 8]).jobs
-    assert [getattr(job.config, section).seed for job in found] == [3, 8]
+def test_seeds_belong_to_the_simulation_or_the_session_and_the_examples_are_studies(folder):
+    sections = {"whisker_maze": "simulation", "create_arena": "create_simulation", "square": "session"}
+    for base, section in sections.items():
+        found = read(folder, base=ROOT / "configs" / f"{base}.yaml", seeds=[3, 8]).jobs
+        assert [getattr(job.config, section).seed for job in found] == [3, 8]
+    assert all(read_study(path).jobs for path in (ROOT / "configs").glob("study_*.yaml"))
 
 
 def test_hashes_follow_from_the_content_of_files_and_from_no_path_or_seed_of_the_base(folder):
@@ -114,14 +122,13 @@ def test_hashes_follow_from_the_content_of_files_and_from_no_path_or_seed_of_the
 def test_how_a_job_is_run_is_part_of_its_key(folder):
     rows = {"all": {}, "off": {"ablation": {"verify": False}}, "copies": {"copies": 2}}
     every, off, first, second = read(folder, rows=rows).jobs
-    (live,), (compared,) = (
-        read(folder, **how).jobs for how in ({"pace": "live"}, {"reference_tier": "dynamic"})
-    )
+    ways = {"pace": "live"}, {"reference_tier": "dynamic"}
+    (live,), (compared,) = (read(folder, **how).jobs for how in ways)
     assert [job.ablation for job in (every, off)] == [FULL, FULL.model_copy(update={"verify": False})]
-    assert [job.copy_number for job in (every, off, first, second)] == [0, 0, 1, 2]
-    assert [job.pace for job in (every, live)] == ["replay", "live"]
-    assert [job.reference_tier for job in (every, compared)] == [None, "dynamic"]
     jobs = every, off, first, second, live, compared
+    assert [job.copy_number for job in jobs] == [0, 0, 1, 2, 0, 0]
+    assert [job.pace for job in jobs] == [*["replay"] * 4, "live", "replay"]
+    assert [job.reference_tier for job in jobs] == [*[None] * 5, "dynamic"]
     assert all(job.config == every.config for job in jobs)
     assert len({job.key for job in jobs}) == len(jobs)
     assert [job.copy_number for job in read(folder, "copies=3").jobs] == [1, 2, 3]
@@ -139,13 +146,6 @@ def test_overrides_are_of_the_study_or_of_all_runs(folder):
     assert not set(StudyPlan.model_fields) & set(RunConfig.model_fields)  # `--set` needs this
 
 
-def test_a_section_is_set_before_its_keys(folder):
-    written = {"keyframes.min_score": 2.0, "keyframes": {"max_distance": 9.0}}
-    found = [read(folder, set=dict(items)).jobs for items in (written.items(), reversed(written.items()))]
-    assert found[0] == found[1]
-    assert found[0][0].config.keyframes.min_score == 2.0
-
-
 GRID = {"keyframes.min_score": [3]}
 TUNE = {"parameters": {"keyframes.min_score": {"low": 1.0, "high": 2.0}}, "objectives": ["exm_arr"]}
 
@@ -158,47 +158,41 @@ def tune(key: str = "keyframes.min_score", **parameter: object) -> dict[str, obj
     return {"tune": TUNE | {"parameters": {key: parameter}}}
 
 
-@pytest.mark.parametrize(
-    ("content", "named"),
-    [
-        ({"base": "nowhere.yaml"}, "nowhere.yaml: no such file"),
-        ({"vary": {"keyframes.min_scor": [1, 2]}}, r"study.yaml:1:.*keyframes.min_scor: .*'min_score'"),
-        (vary(3, 4, 3), "vary.keyframes.min_score.2: 3 given twice"),
-        ({"vary": GRID, "rows": {"a": {"keyframes": {}}}}, "rows.a.keyframes: .*'keyframes.min_score'"),
-        ({"vary": GRID | {"keyframes": [{}]}}, "vary.keyframes: .*'keyframes.min_score' varies"),
-        ({"vary": {"simulation.seed": [1, 2]}}, "simulation.seed: a seed"),
-        ({"base": str(SQUARE), "rows": {"a": {"session.seed": 1}}}, "session.seed: a seed"),
-        ({"set": {"a..b": 3}}, "a..b: not a key path"),
-        ({"seeds": 0}, "seeds: 0"),
-        ({"seeds": 10_001}, "seeds: 10001"),
-        ({"seeds": [1, 1]}, "seeds.* twice"),
-        ({"vary": {f"keyframes.{key}": list(range(1, 60)) for key in "abc"}}, "205379 jobs"),
-        ({"sedes": 3}, "sedes: unknown key.*'seeds'"),
-        ({"tune": TUNE | {"objectives": ["steps"]}}, "objectives.0: 'steps'"),
-        ({"tune": TUNE | {"objectives": []}}, "tune: no objectives"),
-        ({"tune": TUNE | {"minimise": ["exm_arr"]}}, "tune: .*twice"),
-        (tune("keyframes.x", low=1, high=2), "keyframes.x: unknown key"),
-        (tune("recall.leak", low=0.1, high=2.0), "recall.leak: 2"),
-        (tune(low=2, high=2), "low 2 is not below"),
-        (tune(low=0, high=2, log=True), "log needs"),
-        (tune(low=2), "give low and high, or choices"),
-        (tune(low=2, high=3, choices=[1, 2]), "give low and high, or choices"),
-        ({"rows": {"a": {"ablation": {"whiskers": False}}}}, "rows.a.ablation.whiskers: unknown key"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("content", "named"), [
+    ({"base": "nowhere.yaml"}, "nowhere.yaml: no such file"),
+    ({"vary": {"keyframes.min_scor": [1, 2]}}, r"study.yaml:1:.*keyframes.min_scor: .*'min_score'"),
+    (vary(3, 4, 3), "vary.keyframes.min_score.2: 3 given twice"),
+    ({"vary": GRID, "rows": {"a": {"keyframes": {}}}}, "rows.a.keyframes: .*'keyframes.min_score'"),
+    ({"vary": GRID | {"keyframes": [{}]}}, "vary.keyframes: .*'keyframes.min_score' varies"),
+    ({"vary": {"simulation.seed": [1, 2]}}, "simulation.seed: a seed"),
+    ({"base": str(SQUARE), "rows": {"a": {"session.seed": 1}}}, "session.seed: a seed"),
+    ({"set": {"a..b": 3}}, "a..b: not a key path"),
+    ({"seeds": 0}, "seeds: 0"),
+    ({"seeds": 10_001}, "seeds: 10001"),
+    ({"seeds": [1, 1]}, "seeds.* twice"),
+    ({"vary": {f"keyframes.{key}": list(range(1, 60)) for key in "abc"}}, "205379 jobs"),
+    ({"sedes": 3}, "sedes: unknown key.*'seeds'"),
+    ({"tune": TUNE | {"objectives": ["steps"]}}, "objectives.0: 'steps'"),
+    ({"tune": TUNE | {"objectives": []}}, "tune: no objectives"),
+    ({"tune": TUNE | {"minimise": ["exm_arr"]}}, "tune: .*twice"),
+    (tune("keyframes.x", low=1, high=2), "keyframes.x: unknown key"),
+    (tune("recall.leak", low=0.1, high=2.0), "recall.leak: 2"),
+    (tune(low=2, high=2), "low 2 is not below"),
+    (tune(low=0, high=2, log=True), "log needs"),
+    (tune(low=2), "give low and high, or choices"),
+    (tune(low=2, high=3, choices=[1, 2]), "give low and high, or choices"),
+    ({"rows": {"a": {"ablation": {"whiskers": False}}}}, "rows.a.ablation.whiskers: unknown key"),
+])  # fmt: skip
 def test_a_bad_study_is_refused_with_its_place(folder, content, named):
     with pytest.raises(InputError, match=named):
         read(folder, **content)
 
 
-@pytest.mark.parametrize(
-    ("override", "named"),
-    [
-        ("keyframes.min_scor=3", "--set keyframes.min_scor: unknown key"),
-        ("backend=recall", "varied"),
-        ("x", "not an assignment"),
-    ],
-)
+@pytest.mark.parametrize(("override", "named"), [
+    ("keyframes.min_scor=3", "--set keyframes.min_scor: unknown key"),
+    ("backend=recall", "varied"),
+    ("x", "not an assignment"),
+])  # fmt: skip
 def test_a_bad_override_is_refused(folder, override, named):
     with pytest.raises(InputError, match=named):
         read(folder, override, vary={"backend": ["recall", "classic"]})
@@ -208,10 +202,8 @@ def test_every_error_is_reported_once_and_nothing_runs(folder, capsys):
     settings = {"backend": ["recall", "classic"], "keyframes.min_scor": [1, 2]}
     with pytest.raises(InputError) as caught:
         read(folder, vary=settings, set={"recall.leak": "x"})
-    lines = str(caught.value).splitlines()
-    assert len(lines) == 2
-    assert "recall.leak: 'x'" in str(caught.value)
-    assert "keyframes.min_scor: unknown key" in str(caught.value)
+    assert str(caught.value).count("\n") == 1
+    assert all(part in str(caught.value) for part in ("recall.leak: 'x'", "keyframes.min_scor: unknown key"))
     command = ["study", str(folder / "study.yaml"), "-o", str(folder / "never")]
     assert main(command) == 2
     error = capsys.readouterr().err
@@ -223,5 +215,159 @@ def test_every_error_is_reported_once_and_nothing_runs(folder, capsys):
     assert not (folder / "never").exists()
 
 
-def test_the_examples_are_studies():
-    assert all(read_study(path).jobs for path in (ROOT / "configs").glob("study_*.yaml"))
+FINITE = st.floats(-1e6, 1e6)
+FEW = st.sampled_from([0.0, 1.0, 2.0, 3.0, np.nan])
+COSTS = st.lists(st.tuples(FEW, FEW), max_size=8).map(lambda rows: np.array(rows).reshape(-1, 2))
+
+
+def plan(report="means", **more):
+    return StudyPlan(base="base.yaml", report=report, **more)
+
+
+def dominates(a, b):
+    return all(x <= y for x, y in zip(a, b, strict=True)) and any(x < y for x, y in zip(a, b, strict=True))
+
+
+@given(COSTS)
+def test_the_optimal_rows_are_those_that_no_other_dominates(costs):
+    known = [row for row in costs if not np.isnan(row).any()]
+    expected = [not np.isnan(row).any() and not any(dominates(each, row) for each in known) for row in costs]
+    assert pareto_optimal(costs).tolist() == expected
+    assert pareto_optimal(costs).any() == bool(known)
+
+
+@given(st.lists(st.none() | FINITE, max_size=9), st.sampled_from(["energy_all", "exm_arr", "links"]))
+def test_statistics_use_the_defined_values(values, name):
+    found = spread(values, name)
+    known = [value for value in values if value is not None]
+    assert (found is None) == (not known)
+    if not known:
+        return
+    assert found.values == tuple(values)
+    assert found.mean == pytest.approx(sum(known) / len(known), abs=1e-6)
+    assert (found.low, found.median, found.high) == (min(known), statistics.median(known), max(known))
+    assert found.sd == (pytest.approx(statistics.stdev(known)) if len(known) > 1 else None)
+    assert found.worst == {"energy_all": max(known), "exm_arr": min(known), "links": None}[name]
+
+
+def test_an_error_has_a_short_and_a_full_name_and_that_of_recognition_is_known():
+    assert find_error("em") == find_error("energy_all") == "energy_all"
+    assert find_error("exm") == "recognition_error"
+    for name in ("atee", "step_time", "experiences", ""):
+        with pytest.raises(InputError, match="--error") as caught:
+            find_error(name)
+        assert ("'ate'" in str(caught.value)) == (name == "atee")
+
+    def error(**values):
+        return recognition_error(record(**values).quantities).value
+
+    assert error(exm_arr=0.5, exm_arcr_strict=0.8) == pytest.approx(0.6)
+    assert error(exm_arr=0.0, exm_arcr_strict=None) == 1
+    assert np.isnan(error(exm_arr=0.5, exm_arcr_strict=None))
+
+
+def test_the_default_error_is_the_first_that_all_rows_have():
+    rat, grid, none = record(energy_all=1.0, ate_final=1.0), record(ate_final=1.0, map_error=0.2), record()
+
+    def default(*groups):
+        named = [each.model_copy(update={"row": f"{k}"}) for k, group in enumerate(groups) for each in group]
+        return make_report("name", plan("pareto", pace="live"), named).error
+
+    assert default([rat], [rat]) == "energy_all"
+    assert default([rat], [grid]) == "ate_final"
+    assert default([rat, none], [grid]) == "ate_final"
+    assert default([none]) is None
+    assert default() is None
+
+
+def group(row, times, errors):
+    return [
+        record(row, k, time, None if error else "failed", **({"energy_all": error} if error else {}))
+        for k, (time, error) in enumerate(zip(times, errors, strict=True))
+    ]
+
+
+PARETO = [
+    *group("slow", [9, 10, 40], [3, 1, 2]),
+    *group("fast", [1, 2, 3], [5, 6, 7]),
+    *group("lost", [1, 1, 1], [0.5, 0.5, None]),
+    *group("same", [10, 10, 10], [2, 2, 2]),
+]
+
+
+def test_a_row_is_judged_by_medians_and_only_if_none_of_its_runs_failed():
+    found = {row.row: row for row in make_report("name", plan("pareto", pace="live"), PARETO).rows}
+    assert {name for name, row in found.items() if row.optimal} == {"slow", "fast", "same"}
+    time, error = (found["slow"].spreads[name] for name in ("step_time", "energy_all"))
+    assert (time.median, time.low, time.high, time.worst) == (10, 9, 40, 40)
+    assert (error.median, error.low, error.high, error.worst) == (2, 1, 3, 3)
+    assert (found["lost"].runs, found["lost"].failed) == (2, 1)
+    assert not any(row.optimal for row in make_report("name", plan("means"), PARETO).rows)
+
+
+def test_a_pareto_report_marks_the_front_in_every_form_and_has_no_picture_without_an_error(tmp_path):
+    report = make_report("name", plan("pareto", pace="live"), PARETO)
+    assert report.error == "energy_all"
+    table = render(report).split("\n\n")[0].splitlines()
+    assert len({line.count("|") for line in table}) == 1
+    assert [line.startswith("| **") for line in table[2:]] == [True, True, False, True]
+    paths = save_report(report, tmp_path)
+    assert [path.name for path in paths] == ["table.csv", "table.json", "table.md", "pareto.png"]
+    content = json.loads((tmp_path / "table.json").read_text())
+    assert [row["optimal"] for row in content["rows"]] == [True, True, False, True]
+    assert content["measured"]["seeds"] == "3 seeds"
+    rows = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
+    assert [float(row["step_time_median"]) for row in rows] == [10, 2, 1, 10]
+    (tmp_path / "pareto.png").write_text("of an earlier call")
+    report = make_report("name", plan("pareto"), [record("a")])
+    assert report.error is None
+    assert [path.name for path in save_report(report, tmp_path)] == ["table.csv", "table.json", "table.md"]
+    assert not (tmp_path / "pareto.png").exists()
+
+
+def test_means_have_a_line_for_each_row_in_order(tmp_path):
+    report = make_report("name", plan(), [
+        record("one", 0, varied={"x.k": 1}, energy_all=1.0, exm_arr=0.25, ate_online=3.0),
+        record("one", 1, varied={"x.k": 1}, energy_all=3.0, exm_arr=0.75, ate_online=3.0),
+        record("one", 0, varied={"x.k": 2}, energy_all=5.0),
+        record("one", 1, varied={"x.k": 2}, error="no whiskers"),
+    ])  # fmt: skip
+    rows = [(label(row.row, row.varied), row.runs, row.failed) for row in report.rows]
+    assert rows == [("one k=1", 2, 0), ("one k=2", 1, 1)]
+    head, _, first, second, *_ = render(report).splitlines()
+    assert [cell.split()[0] for cell in head.split("|")[2:6]] == ["runs", "steps", "energy_all", "exm_arr"]
+    assert all(cell in first for cell in ("2 ± 1.41 (3)", "0.5 ± 0.354 (0.25)"))
+    assert "1, 1 failed" in second
+    save_report(report, tmp_path)
+    lines = list(csv.DictReader((tmp_path / "table.csv").read_text(encoding="utf-8").splitlines()))
+    assert [line["x.k"] for line in lines] == ["1", "2"]
+    assert float(lines[0]["energy_all_mean"]) == 2.0
+    assert lines[1]["exm_arr_mean"] == ""
+    content = json.loads((tmp_path / "table.json").read_text())
+    assert content["rows"][0]["spreads"]["ate_online"]["worst"] == 3.0
+
+
+def test_differences_are_from_the_first_row_and_odometry_comes_last():
+    values = {"a": 2.0, "b": 3.0, "c": 2.0}
+    rows = [record(row, ate_final=value, odometry=9.0) for row, value in values.items()]
+    report = make_report("name", plan("differences"), rows)
+    first, second, third, last = (line.strip("| ").split() for line in render(report).splitlines()[2:6])
+    assert (first[-1], second[-2:], third[-2:]) == ("2", ["3", "+50%"], ["2", "="])
+    assert (last[:2], "9" in last) == (["dead", "reckoning"], True)
+    assert "1 of 2 rows (50%) end at an ATE of 2.5 m or less" in report.remarks[-1]
+    assert "2 of 2" in make_report("name", plan("differences", limit=3.0), rows).remarks[-1]
+    blind = make_report("name", plan("differences"), [record("a"), record("b")])
+    assert "without true poses" in blind.remarks[-1]
+
+
+def test_disturbances_are_remarked_on_and_labels_are_short():
+    busy = record()
+    busy = busy.model_copy(update={"machine": busy.machine.model_copy(update={"other_load": 2.5})})
+    shared = busy.model_copy(update={"machine": busy.machine.model_copy(update={"workers": 2})})
+    assert make_report("name", plan(), [record()]).remarks == []
+    assert "2.5 cores busy" in make_report("name", plan(), [record(), busy]).remarks[0]
+    assert "disturb" in make_report("name", plan(), [shared]).remarks[0]
+    assert [label("", {}), label("a", {})] == ["as configured", "a"]
+    assert label("a", {"x.k": "v", "y.l": 1.5}) == "a k=v l=1.5"
+    assert label("", {"x.k": 1, "y.k": [2]}) == "x.k=1 y.k=[2]"
+    assert len(make_report("name", plan(), [record(varied={"k": k}) for k in (1, "1")]).rows) == 2

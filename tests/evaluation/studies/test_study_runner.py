@@ -1,7 +1,6 @@
 """Runs of a study or a search: none is lost or repeated, and the outcome does not depend on the process."""
 
-from __future__ import annotations
-
+import contextlib
 import json
 import os
 import signal
@@ -34,30 +33,18 @@ def lines(output):
 
 
 def start_study(study, output, *more, records):
-    """The program that runs a study, when it has as many records."""
     process = start("study", study, "-o", output, *more)
     wait_until(lambda: len(lines(output)) >= records, process)
     return process
 
 
-def members(group):
-    """Processes of a group that have not ended."""
-    found = []
-    for process in psutil.process_iter(["pid", "status"]):
-        try:
-            if os.getpgid(process.pid) == group and process.info["status"] != psutil.STATUS_ZOMBIE:
-                found.append(process.pid)
-        except ProcessLookupError:
-            continue
-    return found
-
-
 def wait_for_end(group):
-    """Waits until all processes of a group have ended."""
     end = time.monotonic() + PATIENCE
-    while members(group):
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    for process in psutil.process_iter(["status"]):
+        with contextlib.suppress(ProcessLookupError, psutil.NoSuchProcess):
+            while os.getpgid(process.pid) == group and process.status() != psutil.STATUS_ZOMBIE:
+                assert time.monotonic() < end
+                time.sleep(0.05)
 
 
 def run(jobs, folder, workers=1, done=None):
@@ -66,11 +53,10 @@ def run(jobs, folder, workers=1, done=None):
 
 
 def outcomes(records):
-    """The parts of records that do not depend on the machine."""
     return [(each.key, each.row, each.varied, each.steps, each.source, each.quantities) for each in records]
 
 
-def test_records_read_back_equal_and_the_last_of_a_run_counts(tmp_path):
+def test_records_read_back_equal_with_all_values_and_the_last_of_a_run_counts(tmp_path):
     copy, later = FULL.model_copy(update={"copy_number": 2}), FULL.model_copy(update={"steps": 7})
     log = RunLog(tmp_path / "new" / "folder")
     for each in (FULL, copy, later):
@@ -79,6 +65,9 @@ def test_records_read_back_equal_and_the_last_of_a_run_counts(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match="cannot be made"):
         RunLog(tmp_path / "file" / "below")
+    values = {"step_time": 40, "step_time_p99": 80, "compile_time": 1, "run_time": 120, "memory": 400}
+    values |= {"energy_all": 0.1 + 0.2, "exm_arr": None, "map_auc": None}
+    assert {name: FULL.value(name) for name in values} == values
 
 
 @pytest.mark.parametrize("content", [b"", b'{"hash": "a", "se', b"{}", b"\xff\xfe", b"[1]", b"\n\n"])
@@ -88,20 +77,6 @@ def test_a_malformed_line_is_skipped_and_the_next_is_complete(tmp_path, content)
     assert log.records == {}
     log.append(FULL)
     assert RunLog(tmp_path).records == {FULL.key: FULL}
-
-
-def test_every_value_has_a_name():
-    names = (
-        "step_time",
-        "step_time_p99",
-        "compile_time",
-        "run_time",
-        "memory",
-        "energy_all",
-        "exm_arr",
-        "map_auc",
-    )
-    assert [FULL.value(name) for name in names] == [40, 80, 1, 120, 400, 0.1 + 0.2, None, None]
 
 
 def test_a_study_killed_by_sigkill_runs_only_what_is_missing(tiny, tmp_path, stubbed):
@@ -145,9 +120,8 @@ def test_lost_records_are_run_again_and_nothing_else(data, scores, tmp_path_fact
         kept = lines(folder)
         lost = data.draw(st.sets(st.sampled_from(range(len(kept)))))
         cut = data.draw(st.integers(0, 300))
-        content = [
-            line[:cut] + b"\n" * (k < len(kept) - 1) if k in lost else line for k, line in enumerate(kept)
-        ]
+        ends = [b"\n"] * (len(kept) - 1) + [b""]
+        content = [line[:cut] + ends[k] if k in lost else line for k, line in enumerate(kept)]
         (folder / FILE).write_bytes(b"".join(content))
         missing = set(calls) - set(RunLog(folder).records)
         assert len(missing) == len(lost)
@@ -173,26 +147,19 @@ def test_failed_runs_are_reported_and_the_others_continue(tiny, tmp_path, capsys
     assert "2 builds" in capsys.readouterr().out
 
 
-def completed_by_kills(requested, kernels):
-    """Replaces `Executor.completed`: every task is killed."""
+def test_killed_runs_are_tried_again_and_speed_is_measured_seed_by_seed(tiny, tmp_path, monkeypatch):
+    requested, functions = [], []
 
     def completed(self, function, tasks, killed):
         requested.extend(tasks)
-        kernels.append(function)
+        functions.append(function)
         return ((k, killed(task)) for k, task in enumerate(tasks))
 
-    return completed
-
-
-def test_killed_runs_are_reported_and_tried_again(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr(Executor, "completed", completed_by_kills([], []))
+    monkeypatch.setattr(Executor, "completed", completed)
     assert [each.error for each in run(read_study(tiny(seeds=2)).jobs, tmp_path)] == [KILLED, KILLED]
     assert not RunLog(tmp_path).records
-
-
-def test_speed_is_measured_seed_by_seed_with_kernels_apart(tiny, tmp_path, monkeypatch):
-    requested, functions = [], []
-    monkeypatch.setattr(Executor, "completed", completed_by_kills(requested, functions))
+    requested.clear()
+    functions.clear()
     rows = {"a": {}, "b": {"session.precision": "float32"}, "twin": {}}
     found = measure_jobs(read_study(tiny(rows=rows, seeds=2)).jobs, RunLog(tmp_path))
     assert [(job.row, job.seed) for job in requested] == [("a", 0), ("b", 0), ("a", 1), ("b", 1)]
@@ -229,19 +196,14 @@ class Killed(Exception):
 
 
 def tune(study, folder, done=None):
-    """The trials: rows of the report of a search."""
     with Executor(1) as executor:
         records = search(study, RunLog(folder), executor, done)
     return make_report(study.name, study.plan, records, search=True).rows
 
 
-def mean(trial, name="energy_all"):
-    return trial.spreads[name].mean
-
-
 def dominates(a, b):
     """Low values of energy_all and high ones of exm_arr are better."""
-    values = [(mean(trial), -mean(trial, "exm_arr")) for trial in (a, b)]
+    values = [(one.spreads["energy_all"].mean, -one.spreads["exm_arr"].mean) for one in (a, b)]
     return all(x <= y for x, y in zip(*values, strict=True)) and values[0] != values[1]
 
 
@@ -254,7 +216,7 @@ def test_trials_are_within_bounds_and_the_optimal_ones_are_not_dominated(tiny, t
         score = trial.varied["keyframes.min_score"]
         assert 1 <= score <= 39
         assert trial.varied["recall.guard"] in range(1, 9)
-        assert mean(trial) == pytest.approx((score - 7) ** 2 + 0.5)
+        assert trial.spreads["energy_all"].mean == pytest.approx((score - 7) ** 2 + 0.5)
         assert trial.optimal == (not any(dominates(other, trial) for other in trials))
     different = {json.dumps(trial.varied) for trial in trials}
     assert len(different) > 8
@@ -283,10 +245,7 @@ def test_a_killed_search_continues_as_if_uninterrupted(tiny, tmp_path, stubbed, 
 
 def test_more_trials_continue_a_search_and_another_seed_makes_another(tiny, tmp_path, stubbed):
     few, more, other = (
-        [
-            replace(trial, optimal=False)
-            for trial in tune(read_study(tiny(tune=TUNE | plan)), tmp_path / "out")
-        ]
+        [replace(one, optimal=False) for one in tune(read_study(tiny(tune=TUNE | plan)), tmp_path / "out")]
         for plan in ({"trials": 8}, {"trials": 12}, {"trials": 4, "seed": 1})
     )
     assert more[:8] == few
@@ -295,16 +254,13 @@ def test_more_trials_continue_a_search_and_another_seed_makes_another(tiny, tmp_
     assert other[0].varied != more[0].varied
 
 
-def test_a_failed_run_fails_its_trial_alone(tiny, tmp_path, stubbed):
+def test_a_failed_run_fails_its_trial_and_a_missing_optuna_is_reported(tiny, tmp_path, stubbed, monkeypatch):
     plan = TUNE | {"parameters": {"keyframes.min_score": {"low": 20.0, "high": 60.0}}}
     trials = tune(read_study(tiny(tune=plan)), tmp_path / "out")
     assert {trial.failed for trial in trials} == {0, 1}
     for trial in trials:
         assert trial.failed == (trial.varied["keyframes.min_score"] > 40)
         assert not (trial.failed and trial.optimal)
-
-
-def test_a_missing_optuna_is_reported(tiny, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(InputError, match=r"ratslam\[sweep\]"):
         tune(read_study(tiny(tune=TUNE)), tmp_path / "out")
@@ -312,8 +268,8 @@ def test_a_missing_optuna_is_reported(tiny, tmp_path, monkeypatch):
 
 def test_the_program_lists_the_optimal_trials(tiny, tmp_path, capsys, stubbed):
     output = tmp_path / "out"
-    command = ["study", str(tiny(tune=TUNE | {"minimise": ["steps"]})), "-o", str(output)]
-    command += ["--workers", "1", "--search"]
+    study = str(tiny(tune=TUNE | {"minimise": ["steps"]}))
+    command = ["study", study, "-o", str(output), "--workers", "1", "--search"]
     assert main(command) == 2
     assert "14 trials, 0 of them Pareto-optimal" in capsys.readouterr().out  # no `steps` in stubs
     tiny(tune=TUNE)
@@ -346,9 +302,9 @@ def test_a_search_killed_repeatedly_has_the_same_result(tiny, tmp_path):
     timed = {metric.name for metric in MEASURED}
 
     def unmeasured(folder):
+        trials = tune(read_study(study), folder)
         return [
-            (trial.row, trial.varied, {k: v for k, v in trial.spreads.items() if k not in timed})
-            for trial in tune(read_study(study), folder)
+            (one.row, one.varied, {k: v for k, v in one.spreads.items() if k not in timed}) for one in trials
         ]
 
     for records in (1, 3, 6):
