@@ -3,39 +3,20 @@
 It shares only the attractor, the sums of differences and the box around the peak with the stock engine.
 """
 
-from __future__ import annotations
-
 import math
 from collections import namedtuple
 from collections.abc import Iterator
 
 import numpy as np
 
-from tests.oracle.stock import (
-    CREATE,
-    EDGE,
-    NONE,
-    SET,
-    Attractor,
-    Cell,
-    Experience,
-    Match,
-    Memory,
-    Pose,
-    box_around,
-    compared_pixels,
-    offsets,
-    summed_differences,
-    wrapped,
-)
+from tests.oracle import stock
+from tests.oracle.stock import CREATE, EDGE, NONE, SET, Attractor, Cell, Experience, Match, Memory, Pose
 from tests.oracle.trace import Array, Parameters
 
 VIEW_TIE = PLACE_TIE = PEAK_TIE = 1e-9
 WORN_OUT = 3.0  # habituation above this injects no energy
 LONGEST_PART, MOST_PARTS = 0.75, 256
 LOST = 1.0  # a difference above one cell is a jump, not a lag
-
-
 Settings = namedtuple("Settings", "recent settle_steps column_angle")
 """Parameters that the stock engine does not have."""
 Input = namedtuple("Input", "motion view label")
@@ -60,36 +41,33 @@ class PlainTemplates:
 
     def __init__(self, parameters: Parameters, settings: Settings) -> None:
         self.parameters, self.settings = parameters, settings
-        self.views: list[Array] = []
-        self.labels: list[int] = []
+        self.views, self.labels = [], []
 
     def see(self, seen: Input) -> Match:
         """The template of a view or of a label."""
-        if seen.view is None:
-            assert seen.label is not None
-            if seen.label in self.labels:
-                return Match(self.labels.index(seen.label), 0.0, 0.0, novel=False)
-            self.labels.append(seen.label)
-            return Match(len(self.labels) - 1, math.inf, 0.0, novel=True)
-        return self.compare(seen.view)
+        if seen.view is not None:
+            return self.compare(seen.view)
+        if seen.label in self.labels:
+            return Match(self.labels.index(seen.label), 0.0, 0.0, novel=False)
+        self.labels.append(seen.label)
+        return Match(len(self.labels) - 1, math.inf, 0.0, novel=True)
 
     def compare(self, view: Array) -> Match:
         """The earliest template, at its lowest offset, among those as good as the best."""
         p, best = self.parameters, math.inf
         if self.views:
-            errors = summed_differences(view, np.stack(self.views), p) / compared_pixels(p)
+            errors = stock.summed_differences(view, np.stack(self.views), p) / stock.compared_pixels(p)
             best = float(errors.min())
             template, column = np.argwhere(errors <= best + VIEW_TIE)[0]
             if best <= p.vt_match_threshold + VIEW_TIE:
-                return Match(int(template), best, self.relative(offsets(p)[column]), novel=False)
+                return Match(int(template), best, self.relative(stock.offsets(p)[column]), novel=False)
         self.views.append(view)
         return Match(len(self.views) - 1, best, 0.0, novel=True)
 
     def relative(self, offset: int) -> float:
-        """The turn of an offset, rad."""
         p = self.parameters
         if p.vt_panoramic:
-            return wrapped(2 * math.pi * offset / p.template_x_size)
+            return stock.wrapped(2 * math.pi * offset / p.template_x_size)
         return (offset - p.vt_shift_match) * self.settings.column_angle
 
 
@@ -118,17 +96,14 @@ class PlainCells:
     """Steps 2 and 3: the network, its decoded pose, and its lag behind the odometry."""
 
     def __init__(self, parameters: Parameters, settings: Settings) -> None:
-        p = parameters
-        self.parameters, self.settings = p, settings
-        self.attractor = Attractor(p)
-        self.rings: Cell = (p.pc_dim_xy, p.pc_dim_xy, p.pc_dim_th)
-        self.heading_cell = 2 * math.pi / p.pc_dim_th
+        self.parameters, self.settings, self.attractor = parameters, settings, Attractor(parameters)
+        self.rings = (parameters.pc_dim_xy, parameters.pc_dim_xy, parameters.pc_dim_th)
+        self.heading_cell = 2 * math.pi / parameters.pc_dim_th
         i, j, k = (n // 2 for n in self.rings)
-        self.activity = np.zeros((p.pc_dim_th, p.pc_dim_xy, p.pc_dim_xy))
+        self.activity = np.zeros(self.rings[::-1])
         self.activity[k, j, i] = 1.0
         self.best: Pose = (float(i), float(j), float(k))
-        self.lag: Pose = (0.0, 0.0, 0.0)
-        self.settling = 0
+        self.lag, self.settling = (0.0, 0.0, 0.0), 0
 
     def deposit(self, energy: float, pose: Pose) -> None:
         """Share an energy among the cells around a pose."""
@@ -143,7 +118,7 @@ class PlainCells:
         for a in pose:
             f = a - math.floor(a)
             energy /= (1 - f) * math.exp(-(f**2) / spread) + f * math.exp(-((1 - f) ** 2) / spread)
-        self.deposit(energy, (pose[0], pose[1], pose[2]))
+        self.deposit(energy, pose)
 
     def move(self, motion: Pose, injected: bool) -> None:
         """Step 3."""
@@ -155,11 +130,8 @@ class PlainCells:
         reach = max(math.hypot(*moved_cells[:2]) + math.hypot(*lag[:2]), abs(moved_cells[2] + lag[2]))
         parts = max(1, math.ceil(reach / LONGEST_PART - 1e-9))
         if parts > MOST_PARTS:
-            moved_cells, lag, parts = (
-                moved_cells * (MOST_PARTS / parts),
-                lag * (MOST_PARTS / parts),
-                MOST_PARTS,
-            )
+            moved_cells, lag = moved_cells * (MOST_PARTS / parts), lag * (MOST_PARTS / parts)
+            parts = MOST_PARTS
         before, died = self.best, False
         for part in range(parts):
             died |= self.settle(before)
@@ -188,26 +160,24 @@ class PlainCells:
         self.activity[layers] = shifted(shifted(self.activity[layers], along_x, 2), along_y, 1)
         low = math.floor(turn)
         f = turn - low
-        self.activity = (1 - f) * np.roll(self.activity, low, axis=0) + f * np.roll(
-            self.activity, low + 1, axis=0
-        )
+        whole, more = (np.roll(self.activity, low + up, axis=0) for up in (0, 1))
+        self.activity = (1 - f) * whole + f * more
 
     def decoded(self) -> Pose:
         """The pose of the box around the first peak, layer by layer, row by row, cell by cell."""
-        peak: list[int] = []
-        part = self.activity
+        peak, part = [], self.activity
         while part.ndim:
             largest = part.reshape(len(part), -1).max(axis=1)
             peak.append(int(np.flatnonzero(largest >= largest.max() * (1 - PEAK_TIE))[0]))
             part = part[peak[-1]]
-        box, (ks, js, xs) = box_around(self.activity, (peak[0], peak[1], peak[2]))
+        box, (ks, js, xs) = stock.box_around(self.activity, tuple(peak))
         sums = (box.sum(axis=(0, 1)), box.sum(axis=(0, 2)), box.sum(axis=(1, 2)))
         pose = []
         for marginal, indices, n in zip(sums, (xs, js, ks), self.rings, strict=True):
             angles = 2 * math.pi * indices / n
             mean = math.atan2(float(marginal @ np.sin(angles)), float(marginal @ np.cos(angles)))
             pose.append(on_ring(mean * n / (2 * math.pi), n))
-        return pose[0], pose[1], pose[2]
+        return tuple(pose)
 
     def behind(self, moved_cells: Array, lag: Array, before: Pose, died: bool) -> Pose:
         """Difference between the commanded and the decoded motion."""
@@ -221,7 +191,7 @@ class PlainCells:
         rest = [around(float(w - m), n) for w, m, n in zip(expected, moved, self.rings, strict=True)]
         if died or any(abs(r) > LOST for r in rest):
             return 0.0, 0.0, 0.0
-        return rest[0], rest[1], rest[2]
+        return tuple(rest)
 
 
 class PlainPlaces:
@@ -231,9 +201,7 @@ class PlainPlaces:
         radius = parameters.exp_delta_pc_threshold
         self.radii = (radius, radius, heading_radius or radius)
         self.rings = (parameters.pc_dim_xy, parameters.pc_dim_xy, parameters.pc_dim_th)
-        self.places: list[Experience] = []
-        self.joined: set[frozenset[int]] = set()
-        self.current = -1
+        self.places, self.joined, self.current = [], set(), -1
 
     def far(self, place: int, packet: Pose) -> float:
         """The distance in radii."""
@@ -268,15 +236,11 @@ class PlainEngine:
 
     def __init__(self, parameters: Parameters, settings: Settings) -> None:
         self.parameters, self.settings = parameters, settings
-        self.templates = PlainTemplates(parameters, settings)
-        self.cells = PlainCells(parameters, settings)
-        self.places = PlainPlaces(parameters)
-        self.memories: list[Memory] = []
-        self.template = -1
-        self.relative = 0.0
+        self.templates, self.cells = PlainTemplates(parameters, settings), PlainCells(parameters, settings)
+        self.places, self.memories = PlainPlaces(parameters), []
+        self.template, self.relative = -1, 0.0
 
     def step(self, seen: Input) -> PlainStep:
-        """One observation."""
         viewed = seen.view is not None or seen.label is not None
         energy = self.recall(self.templates.see(seen)) if viewed else 0.0
         if energy > 0:

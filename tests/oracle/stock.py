@@ -1,8 +1,6 @@
 """The stock engine in NumPy and Python, written from `openratslam.md`, sections 1 to 5, with all deviations
 of section 7 (Q1 to Q23): it must reproduce the reference traces."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections import namedtuple
@@ -15,10 +13,8 @@ from tests.oracle.trace import Array, Parameters, Row
 
 # Views and the templates they are compared with (section 3)
 
-# Initial error of the stock engine's search; it remains when nothing was compared.
 NOTHING_COMPARED = sys.float_info.max
-
-
+"""Initial error of the stock engine's search; it remains when nothing was compared."""
 Match = namedtuple("Match", "template error relative novel")
 """The matched template of a view, its error, the turn, rad, and whether it is new."""
 
@@ -66,9 +62,7 @@ class StockTemplates:
     """Section 3: the stock engine's templates. They are never updated, merged or deleted."""
 
     def __init__(self, parameters: Parameters) -> None:
-        self.parameters = parameters
-        self.stored: list[Array] = []
-        self.means: list[float] = []
+        self.parameters, self.stored, self.means = parameters, [], []
 
     def see(self, view: Array) -> Match:
         """The best template that passes the gate on the mean, or a new one."""
@@ -102,14 +96,13 @@ BOX = 3  # half width of the box that is decoded
 
 
 def circulant(n: int, width: int, sigma: float) -> Array:
-    """One axis of the normalised Gaussian as a matrix: row: target cell, column: source cell."""
+    """One axis of the normalised Gaussian as a matrix; row: target cell, column: source cell."""
     reach = np.arange(-(width // 2), width // 2 + 1)
     weights = np.exp(-(reach**2) / (2 * sigma * sigma))
     return sum(w * np.roll(np.eye(n), o, axis=0) for o, w in zip(reach, weights / weights.sum(), strict=True))
 
 
 def along_axes(matrices: list[Array], activity: Array) -> Array:
-    """Apply one matrix per axis."""
     k, j, i = matrices
     return np.matmul(np.matmul(j, np.tensordot(k, activity, axes=(1, 0))), i.T)
 
@@ -119,16 +112,16 @@ class Attractor:
 
     def __init__(self, parameters: Parameters) -> None:
         p = parameters
-        self.global_inhibition = p.pc_global_inhib
         lengths = (p.pc_dim_th, p.pc_dim_xy, p.pc_dim_xy)
         self.excite = [circulant(n, p.pc_w_e_dim, p.pc_w_e_var) for n in lengths]
         self.inhibit = [circulant(n, p.pc_w_i_dim, p.pc_w_i_var) for n in lengths]
+        self.suppressed = p.pc_global_inhib
 
     def inhibited(self, activity: Array) -> Array:
         """The activity after steps a, b and c, not yet normalised."""
         excited = along_axes(self.excite, activity)
         left = excited - along_axes(self.inhibit, excited)
-        return np.where(left >= self.global_inhibition, left - self.global_inhibition, 0.0)
+        return np.where(left >= self.suppressed, left - self.suppressed, 0.0)
 
 
 def translated_leaky(activity: Array, distance: float) -> Array:
@@ -206,8 +199,7 @@ class StockCells:
 
     def __init__(self, parameters: Parameters) -> None:
         p = parameters
-        self.cell_size = p.pc_cell_x_size
-        self.attractor = Attractor(p)
+        self.cell_size, self.attractor = p.pc_cell_x_size, Attractor(p)
         start = (p.pc_dim_th // 2, p.pc_dim_xy // 2, p.pc_dim_xy // 2)
         self.activity = np.zeros((p.pc_dim_th, p.pc_dim_xy, p.pc_dim_xy))
         self.activity[start] = 1.0
@@ -261,11 +253,8 @@ class StockPlaces:
     """Section 4 without the activity: template decays, experiences and the decision about actions."""
 
     def __init__(self, parameters: Parameters) -> None:
-        self.parameters = parameters
-        self.memories: list[Memory] = []
-        self.experiences: list[Experience] = []
-        self.template = self.previous_template = 0
-        self.experience = 0
+        self.parameters, self.memories, self.experiences = parameters, [], []
+        self.template = self.previous_template = self.experience = 0
         # Written only together with an injection, so it is stale otherwise; the traces start it at 0 (Q14).
         self.turned = 0.0
         self.viewed = self.moved = False
@@ -317,8 +306,7 @@ class StockPlaces:
 
     def act(self, best: Pose) -> int:
         """`get_action`: needs both a view and an odometry message since the last call."""
-        ready = self.viewed and self.moved
-        if not ready:
+        if not (self.viewed and self.moved):
             # The other flag stays for the message that is still missing, which sets only its own.
             return NONE
         self.viewed = self.moved = False
@@ -359,15 +347,10 @@ class StockMap:
     """Section 5: nodes and links, relaxed in place, with the accumulators in the world frame (Q9)."""
 
     def __init__(self, parameters: Parameters) -> None:
-        self.correction = parameters.exp_correction
-        self.loops = parameters.exp_loops
-        self.x: list[float] = []
-        self.y: list[float] = []
-        self.th: list[float] = []
-        self.outgoing: list[list[Link]] = []
-        self.links: list[Link] = []  # in order of creation
-        self.current = 0
-        self.dx = self.dy = self.time = 0.0
+        self.correction, self.loops = parameters.exp_correction, parameters.exp_loops
+        self.x, self.y, self.th = [], [], []
+        self.outgoing, self.links = [], []  # by start node; all in order of creation
+        self.current, self.dx, self.dy, self.time = 0, 0.0, 0.0, 0.0
         self.facing = math.radians(parameters.exp_initial_em_deg)
 
     def move(self, v: float, w: float, dt: float) -> None:
@@ -401,8 +384,7 @@ class StockMap:
 
     def link(self, a: int, b: int, relative: float) -> None:
         """Join two nodes unless they are joined in either direction. The time is never cleared (Q8)."""
-        joined = any(k.end == b for k in self.outgoing[a]) or any(k.end == a for k in self.outgoing[b])
-        if joined:
+        if any({k.start, k.end} == {a, b} for k in self.links):
             return
         heading = wrapped(math.atan2(self.dy, self.dx) - self.th[a])
         facing = wrapped(wrapped(self.facing + relative) - self.th[a])
@@ -421,14 +403,11 @@ class StockMap:
     def relax(self) -> None:
         """`iterate`: Gauss-Seidel over all links; no node is anchored."""
         x, y, th, g = self.x, self.y, self.th, self.correction
-        cos, sin = math.cos, math.sin
-        by_node = (link for outgoing in self.outgoing for link in outgoing)
-        links = [(k.start, k.end, k.distance, k.heading, k.facing) for k in by_node]
         for _ in range(self.loops):
-            for a, b, distance, heading, facing in links:
+            for a, b, distance, heading, facing, _ in (k for links in self.outgoing for k in links):
                 direction = th[a] + heading
-                ex = g * (x[b] - (x[a] + distance * cos(direction)))
-                ey = g * (y[b] - (y[a] + distance * sin(direction)))
+                ex = g * (x[b] - (x[a] + distance * math.cos(direction)))
+                ey = g * (y[b] - (y[a] + distance * math.sin(direction)))
                 eth = wrapped(th[b] - th[a] - facing)
                 x[a] += ex
                 y[a] += ey
@@ -450,17 +429,19 @@ class StockEngine:
 
     def __init__(self, parameters: Parameters) -> None:
         self.parameters = parameters
-        self.templates = StockTemplates(parameters)
-        self.cells = StockCells(parameters)
-        self.places = StockPlaces(parameters)
-        self.map = StockMap(parameters)
+        self.templates, self.cells = StockTemplates(parameters), StockCells(parameters)
+        self.places, self.map = StockPlaces(parameters), StockMap(parameters)
         # A stamp of exactly 0 means that there was no message before (Q22).
         self.stamp = 0.0
 
     def step(self, row: Row) -> Step:
         match, energy, injected = None, 0.0, None
-        if row.seen:
-            match = self.match(row)
+        if row.view is not None:
+            match = self.templates.see(row.view)
+        elif row.label is not None:
+            new = row.label[0] >= len(self.places.memories)
+            match = Match(row.label[0], 0.0, row.label[1], novel=new)
+        if match is not None:
             recalled = self.places.see(match.template, match.relative, self.cells.best)
             if recalled:
                 injected = self.cells.inject(*recalled)
@@ -481,11 +462,3 @@ class StockEngine:
         if row.odometry:
             self.stamp = row.stamp
         return Step(match, energy, injected, delta, action, source, self.places.experience)
-
-    def match(self, row: Row) -> Match:
-        """The template of the row's view, or the template given in the row."""
-        if row.label is not None:
-            template, relative = row.label
-            return Match(template, 0.0, relative, novel=template >= len(self.places.memories))
-        assert row.view is not None
-        return self.templates.see(row.view)

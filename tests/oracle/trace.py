@@ -1,12 +1,9 @@
 """A trace: the parameters, the input rows and the recorded outputs of one `.npz` file."""
 
-from __future__ import annotations
-
 import json
 import os
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -15,11 +12,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 VIEW, ODOMETRY = 1, 2
 ROOT = Path(__file__).parents[2]
-GOLDEN = ROOT / "tests" / "golden"
 
 
-@dataclass(frozen=True)
-class Parameters:
+class Parameters(NamedTuple):
     """Section 1: the parameters with their defaults; the widths and sigmas of the kernels are integers."""
 
     pc_dim_xy: int = 21
@@ -45,14 +40,13 @@ class Parameters:
     exp_initial_em_deg: float = 90.0
 
     @classmethod
-    def from_strings(cls, strings: Mapping[str, object]) -> Parameters:
+    def from_strings(cls, strings):
         """Reads the named parameters, with defaults for the others; ignores those of camera images."""
-        kinds = {field.name: int if field.type == "int" else float for field in fields(cls)}
+        kinds = cls.__annotations__
         return cls(**{name: kinds[name](str(text)) for name, text in strings.items() if name in kinds})
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """One row of the input. `label` is a given template and its turn; both None: no view."""
 
     stamp: float
@@ -62,26 +56,19 @@ class Row:
     view: Array | None
     label: tuple[int, float] | None
 
-    @property
-    def seen(self) -> bool:
-        """Whether the row holds a view at all, as an image or as a label."""
-        return self.view is not None or self.label is not None
 
-
-@dataclass(frozen=True)
 class Trace:
-    """One file. `arrays` holds everything in it under its own name."""
+    """One file: its parameters, also as `strings`, whether its views are labels, and all its `arrays`."""
 
-    path: Path
-    parameters: Parameters
-    strings: dict[str, str]
-    labelled: bool
-    arrays: dict[str, NDArray[np.generic]]
+    def __init__(self, path: Path):
+        self.path = path
+        with np.load(path, allow_pickle=False) as file:
+            self.arrays = dict(file)
+        self.strings = json.loads(str(self.arrays["params_json"][()]))
+        self.parameters = p = Parameters.from_strings(self.strings)
+        self.labelled = self.arrays["in_view"].shape[1] == 2 != p.template_x_size * p.template_y_size
 
-    def __len__(self) -> int:
-        return len(self.arrays["in_t"])
-
-    def rows(self) -> Iterator[Row]:
+    def rows(self):
         """The input rows in order; NaN means that no view was seen in the row."""
         shape = (self.parameters.template_y_size, self.parameters.template_x_size)
         columns = (self.arrays[name] for name in ("in_t", "in_v", "in_w", "in_flags", "in_view"))
@@ -95,17 +82,8 @@ class Trace:
             yield Row(float(stamp), float(v), float(w), bool(int(flags) & ODOMETRY), view, label)
 
 
-def load(path: Path) -> Trace:
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
-    strings = json.loads(str(arrays["params_json"][()]))
-    parameters = Parameters.from_strings(strings)
-    labelled = arrays["in_view"].shape[1] == 2 != parameters.template_x_size * parameters.template_y_size
-    return Trace(path, parameters, strings, labelled, arrays)
-
-
 def golden(name: str) -> Trace:
-    return load(GOLDEN / f"{name}.npz")
+    return Trace(ROOT / "tests" / "golden" / f"{name}.npz")
 
 
 def real(name: str) -> Trace:
@@ -114,12 +92,11 @@ def real(name: str) -> Trace:
     path = data / "traces" / f"{name}.npz"
     if not path.is_file():
         pytest.skip(f"no {path}: set RATSLAM_DATA to the folder that holds traces/")
-    return load(path)
+    return Trace(path)
 
 
 def changed(folder: Path, **changes: object) -> Trace:
     """The smallest golden trace with some of its arrays replaced."""
-    arrays = dict(golden("j_reverse_stop").arrays) | changes
     path = folder / "changed.npz"
-    np.savez(path, **arrays)
-    return load(path)
+    np.savez(path, **golden("j_reverse_stop").arrays | changes)
+    return Trace(path)

@@ -1,6 +1,4 @@
-"""Laws of the classic map: places, the experience map and its relaxation."""
-
-from __future__ import annotations
+"""Laws of the classic map: places, the experience map and its relaxation; laws of view matching."""
 
 from typing import NamedTuple
 
@@ -11,13 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ratslam.classic import view_templates
 from ratslam.classic.experience_map import ExperienceConfig, ExperienceMap, PlaceConfig, decide
 from ratslam.classic.experience_map import start as empty_store
 from ratslam.classic.relaxation import relax
+from ratslam.classic.view_templates import TemplateConfig
 from ratslam.core.estimates import Action, Estimate
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
 from tactile.base.types import Odometry, observation
-from tests.oracle.plain import PlainPlaces
+from tests.oracle.plain import PlainPlaces, PlainTemplates, Settings
 from tests.oracle.stock import Link, StockMap
 from tests.oracle.trace import Parameters
 
@@ -54,29 +54,26 @@ def test_without_closures_the_map_is_raw_odometry(steps):
 
 def square(world: ExperienceMap, sign: float):
     """Three laps of a unit square; views of later laps are seen rotated by a known angle."""
-    for k in range(12):
-        relative = 0.0 if k < 4 else 0.4 * (k % 3 - 1)
-        before = 0.0 if k <= 4 else 0.4 * ((k - 1) % 3 - 1)
+    turned = [0.0 if k < 4 else 0.4 * (k % 3 - 1) for k in range(12)]
+    for k, relative in enumerate(turned):
         # The robot stands turned by `relative` against the heading at which it stored the place.
-        moved = compose(inverse(np.array([0, 0, before])), np.array([1.0, 0, np.pi / 2 + relative]))
-        if k == 0:
-            moved = np.zeros(3)
+        before, ahead = np.array([0, 0, turned[k - 1]]), np.array([1.0, 0, np.pi / 2 + relative])
+        moved = compose(inverse(before), ahead) if k else np.zeros(3)
         action = Action.CREATE if k < 4 else Action.LINK if k == 4 else Action.SET
         fold(world, moved, action, k % 4, sign * relative)
 
 
 @pytest.mark.parametrize("solver", ["least_squares", "relaxation"])
 def test_relative_headings_are_subtracted(solver):
-    config = ExperienceConfig.model_validate({"solver": {"name": solver}})
-    errors = {}
+    errors = []
     for sign in (1.0, -1.0):
-        world = ExperienceMap(config)
+        world = ExperienceMap(ExperienceConfig.model_validate({"solver": {"name": solver}}))
         square(world, sign)
         corners = world.nodes()[:, :2]
         sides = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
-        errors[sign] = np.abs(sides - 1).max()
-    assert errors[1.0] < 1e-6
-    assert errors[-1.0] > 0.05
+        errors.append(np.abs(sides - 1).max())
+    assert errors[0] < 1e-6
+    assert errors[1] > 0.05
 
 
 def test_traversals_are_evidence_in_either_direction():
@@ -84,11 +81,9 @@ def test_traversals_are_evidence_in_either_direction():
     fold(world, (0, 0, 0), Action.CREATE, 0)
     fold(world, (1.0, 0, 0), Action.CREATE, 1, dt=2.0)
     fold(world, (-1.2, 0, 0), Action.SET, 0, dt=3.0)
-    edges = world.edges()
-    assert len(edges.i) == 1
+    assert len(world.edges().i) == 1
     link = world.graph().edges[0, 1]
-    assert link["traversals"] == 2
-    assert link["duration"] == 5.0
+    assert (link["traversals"], link["duration"]) == (2, 5.0)
     assert 1.0 < link["dx"] < 1.2
 
 
@@ -129,22 +124,13 @@ def test_invalid_odometry_changes_nothing():
     assert len(world.nodes()) == 1
 
 
-# Relaxation
-
-
-def links(poses, ends):
-    motion = between(poses[ends[:, 0]], poses[ends[:, 1]])
-    length, bearing = np.hypot(motion[:, 0], motion[:, 1]), np.arctan2(motion[:, 1], motion[:, 0])
-    return ends[:, 0], ends[:, 1], length, bearing, motion[:, 2]
-
-
 @given(seed=st.integers(0, 2**32 - 1), correction=st.floats(0.05, 1), loops=st.integers(0, 5))
 def test_the_sweep_is_that_of_the_stock_engine(seed, correction, loops):
-    """Order, signs and shares."""
     rng = np.random.default_rng(seed)
     poses = rng.uniform(-3, 3, (12, 3))
-    ends = np.array([rng.permutation(12)[:2] for _ in range(20)])
-    table = links(rng.uniform(-3, 3, (12, 3)), ends)
+    ends = np.array([rng.permutation(12)[:2] for _ in range(20)]).T
+    x, y, turn = between(*rng.uniform(-3, 3, (12, 3))[ends]).T
+    table = *ends, np.hypot(x, y), np.arctan2(y, x), turn
     ours = relax(poses, table, loops, correction)
     stock = StockMap(Parameters(exp_correction=correction, exp_loops=loops))
     stock.x, stock.y, stock.th = poses.T.tolist()
@@ -155,12 +141,10 @@ def test_the_sweep_is_that_of_the_stock_engine(seed, correction, loops):
 
 
 def test_empty_graphs_are_unchanged():
-    none = np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0), np.zeros(0)
+    none = *np.zeros((2, 0), int), *np.zeros((3, 0))
     assert relax(np.ones((1, 3)), none, 3, 0.5).tolist() == [[1.0, 1.0, 1.0]]
     assert relax(np.zeros((0, 3)), none, 3, 0.5).shape == (0, 3)
 
-
-# Places
 
 CONFIG = PlaceConfig(radius=2.0, radius_heading=3.0)
 RINGS = np.array([11.0, 11.0, 36.0])
@@ -207,7 +191,6 @@ def test_decisions_are_those_of_the_plain_engine(visits):
 
 
 def test_without_a_view_nothing_is_decided():
-    """Unseen steps leave the store as it is, wherever the packet is."""
     store, *_ = walk([(A, 0), (B, 1)])
     after, at, _, actions, _ = walk([(A, 0), (B, 1), (C, 7, False), (A, 0, False)])
     assert (actions[2:], at[2:]) == ((Action.NONE,) * 2, (1, 1))
@@ -215,9 +198,113 @@ def test_without_a_view_nothing_is_decided():
 
 
 def test_a_full_store_is_reported_and_overwrites_nothing():
-    """Without room no place is created, the current one stays, and known ones are still reached."""
     store, *_ = walk([(A, 0), (B, 1)], capacity=2)
     after, at, _, actions, room = walk([(A, 0), (B, 1), (C, 2), (A, 0)], capacity=2)
     assert room == (1, 1, 0, 1)
     assert (actions[2:], at[2:]) == ((Action.NONE, Action.SET), (1, 0))
     assert_same(after._replace(current=store.current), store)
+
+
+SHAPE, YES = (3, 8, 1), jnp.bool_(True)
+
+
+def filled(config, views, capacity=16):
+    store = view_templates.start(config, SHAPE, capacity, np.dtype(float))
+    for k, view in enumerate(views):
+        flat, packet = jnp.asarray(view.reshape(-1)), jnp.full(3, float(k))
+        store, _ = view_templates.learn(store, flat, jnp.int32(100 + k), packet, YES)
+    return store
+
+
+def matched(k):
+    return view_templates.Match(jnp.int32(k), jnp.asarray(0.0), jnp.asarray(0.0))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"shift": 2, "column_angle": 0.1}, {"shift": 3, "shift_step": 2}, {"panoramic": True}],
+    ids=["in-place", "shift", "coarse-shift", "panoramic"],
+)
+@pytest.mark.parametrize("seed", range(4))
+def test_the_best_match_is_that_of_the_plain_engine(settings, seed):
+    config = TemplateConfig.model_validate(settings | {"threshold": 1.0})
+    stream = np.random.default_rng(seed)
+    views = stream.random((7, *SHAPE))
+    view = np.clip(np.roll(views[4], seed % 3, axis=1) + stream.normal(0, 0.01, SHAPE), 0, 1)
+    found = view_templates.match_view(config, SHAPE, filled(config, views), jnp.asarray(view))
+    fixed = {"template_y_size": 3, "template_x_size": 8, "vt_match_threshold": 1.0}
+    shifts = {"vt_shift_match": config.shift, "vt_step_match": config.shift_step}
+    p = Parameters(**fixed, **shifts, vt_panoramic=int(config.panoramic))
+    slow = PlainTemplates(p, Settings(config.recent, 0, config.column_angle))
+    slow.views = list(views[..., 0])
+    expected = slow.compare(view[..., 0])
+    assert int(found.template) == expected.template
+    assert float(found.error) == pytest.approx(expected.error, abs=1e-12)
+    assert float(found.relative) == pytest.approx(expected.relative, abs=1e-12)
+
+
+def test_ties_go_to_the_earliest():
+    config = TemplateConfig(panoramic=True)
+    flat = np.full(SHAPE, 0.5)
+    found = view_templates.match_view(config, SHAPE, filled(config, [flat, flat, flat]), jnp.asarray(flat))
+    assert int(found.template) == 0
+    assert float(found.relative) == 0
+
+
+def test_an_empty_store_and_a_far_view_match_nothing():
+    config = TemplateConfig()
+    view = jnp.full(SHAPE, 0.9)
+    assert int(view_templates.match_view(config, SHAPE, filled(config, []), view).template) == -1
+    found = view_templates.match_view(config, SHAPE, filled(config, [np.zeros(SHAPE)]), view)
+    assert int(found.template) == -1
+    assert float(found.error) == pytest.approx(0.9)
+
+
+def test_labels_of_any_number_find_their_template():
+    config = TemplateConfig(source="labels")
+    store = filled(config, [np.zeros(0)] * 3)
+    assert int(view_templates.match_label(store, jnp.int32(102)).template) == 2
+    assert int(view_templates.match_label(store, jnp.int32(7)).template) == -1
+
+
+def test_energy_falls_during_a_view_and_recovers_later():
+    config = TemplateConfig(recent=0)
+    store = filled(config, [np.zeros(SHAPE), np.ones(SHAPE)])
+    energies = []
+    for _ in range(30):
+        store, energy = view_templates.recall(config, store, matched(0), YES)
+        energies.append(float(energy) / config.energy)
+    assert energies[0] == pytest.approx((30 - np.exp(1.2)) / 30)
+    assert energies[1] == pytest.approx((30 - np.exp(1.2 * 2.0)) / 30)
+    assert energies[-1] == 0
+    for _ in range(60):
+        store, _ = view_templates.recall(config, store, matched(1), YES)
+    _, energy = view_templates.recall(config, store, matched(0), YES)
+    assert float(energy) / config.energy == pytest.approx(energies[0])
+
+
+def test_recent_templates_recall_nothing():
+    config = TemplateConfig(recent=2)
+    store = filled(config, [np.zeros(SHAPE)] * 3)
+    energies = [float(view_templates.recall(config, store, matched(k), YES)[1]) for k in range(3)]
+    assert energies[0] > 0
+    assert energies[1:] == [0, 0]
+
+
+def test_a_full_store_keeps_its_templates():
+    config = TemplateConfig()
+    views = np.random.default_rng(0).random((4, *SHAPE))
+    store = filled(config, views, capacity=4)
+    after, room = view_templates.learn(store, jnp.zeros(24), jnp.int32(9), jnp.zeros(3), YES)
+    assert not room
+    assert np.array_equal(after.view, store.view)
+    assert int(after.count) == 4
+
+
+def test_flat_and_empty_views_survive_normalisation():
+    patchy = TemplateConfig(patch=1)
+    assert np.allclose(view_templates.normalise(patchy, jnp.full(SHAPE, 0.3)), 0.5)
+    scaled = TemplateConfig(normalise_mean=0.4)
+    assert not np.any(view_templates.normalise(scaled, jnp.zeros(SHAPE)))
+    view = jnp.asarray(np.random.default_rng(0).random(SHAPE) * 0.3)
+    assert float(jnp.mean(view_templates.normalise(scaled, view))) == pytest.approx(0.4, abs=0.05)

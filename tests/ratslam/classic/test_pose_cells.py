@@ -1,7 +1,5 @@
 """Laws of the attractor network; at every level of its window it equals that on the whole torus."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax
@@ -11,19 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ratslam.classic import levels, pose_cells
+from ratslam.classic import levels as hold
+from ratslam.classic import pose_cells
 from ratslam.classic.cell_probe import active_cells, activity_of, choose_cells, hold_cells
 from ratslam.classic.config import NetworkConfig, rings, units
 from ratslam.classic.excitation_inhibition import make_window, ring_difference
-from ratslam.classic.levels import (
-    Activity,
-    Block,
-    StepInput,
-    activity_sums,
-    step_at,
-    to_full_torus,
-    window_levels,
-)
+from ratslam.classic.levels import Activity, Block, StepInput, step_at, to_full_torus, window_levels
 from ratslam.classic.pose_cells import Outcome
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
@@ -34,8 +25,6 @@ from tests.oracle.trace import Parameters
 CONFIG = NetworkConfig()
 UNITS = units(CONFIG, np.dtype(float))
 RINGS = rings(CONFIG, np.dtype(float))
-
-
 ROOMS = 32768, 131072
 """Largest numbers of steps of a compiled call."""
 MOST = 5000
@@ -89,9 +78,9 @@ def as_type(cells, dtype):
     return jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype == float else leaf, cells)
 
 
-@jax.jit
-def whole(cells):
-    return to_full_torus(window_levels(CONFIG, cells.pose.dtype), cells.activity)
+@partial(jax.jit, static_argnames="config")
+def whole(cells, config=CONFIG):
+    return to_full_torus(window_levels(config, cells.pose.dtype), cells.activity)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +102,6 @@ def travelled(start, poses):
     ],
 )
 def test_decoded_motion_equals_composed_odometry(settled, speed, direction, degrees):
-    """Odometry is the new pose in the frame of the old one, in the network as in the map."""
     angle, count = np.deg2rad(direction), min(200 / abs(degrees) if degrees else 20 / speed, MOST)
     one = np.array([speed * np.cos(angle), speed * np.sin(angle), np.deg2rad(degrees) / UNITS[2]])
     motion, scale = np.tile(one, (int(np.ceil(count)), 1)), [1, 1, UNITS[2]]
@@ -130,9 +118,8 @@ def test_decoded_motion_equals_composed_odometry(settled, speed, direction, degr
 def test_a_step_takes_as_few_substeps_as_keep_the_packet_whole(settled, speed, substeps):
     still = settled._replace(lag=jnp.zeros(3))
     motion, zero = jnp.asarray([speed, 0.0, 0.0]), jnp.zeros(3)
-    inputs = StepInput(
-        still.pose, still.pose, jnp.zeros(()), jnp.int32(substeps), motion / substeps, zero, zero[2]
-    )
+    count = jnp.int32(substeps)
+    inputs = StepInput(still.pose, still.pose, zero[2], count, motion / substeps, zero, zero[2])
     smallest = window_levels(CONFIG, np.dtype(float))[0]
     _, result, exact = jax.jit(partial(step_at, smallest))(still.activity.blocks[0], inputs)
     assert exact
@@ -175,14 +162,11 @@ def test_excitation_and_inhibition_are_those_of_the_plain_engine(n):
 @pytest.mark.parametrize("energy", [0.15, 0.3])
 @pytest.mark.parametrize("distance", [0.7, 2.3, 4.0, 7.0])
 def test_feedback_never_undoes_a_closure(settled, distance, energy):
-    """An injection moves the packet as far with lag feedback as without."""
     at = (np.asarray(settled.pose) + [0, distance, 0.4]) % RINGS
-    injections = {0: (at, energy), 1: (at, 0.7 * energy)}
-    motion = np.tile([0.02, 0, 0], (80, 1))
+    injections, motion = {0: (at, energy), 1: (at, 0.7 * energy)}, np.tile([0.02, 0, 0], (80, 1))
     open_loop = CONFIG.model_copy(update={"settle_steps": 10**6})
-    _, (free, _, _) = go(motion, settled, injections, open_loop)
-    _, (fed, _, _) = go(motion, settled, injections)
-    pulled, actual = travelled(settled.pose, free)[1], travelled(settled.pose, fed)[1]
+    runs = (go(motion, settled, injections, config)[1][0] for config in (open_loop, CONFIG))
+    pulled, actual = (travelled(settled.pose, poses)[1] for poses in runs)
     assert abs(actual - pulled) < 0.3
     if abs(pulled) > 0.5:
         assert actual > 0.85 * pulled
@@ -221,19 +205,11 @@ def test_float32_makes_the_same_step(settled):
     assert worst_activity <= 1e-7
 
 
-# The adaptive window
-
 LEVELS_OF = {11: 2, 21: 2, 41: 3, 61: 4}
 """Cells per side, and the number of window levels there."""
 
 
-@partial(jax.jit, static_argnums=0)
-def full_activity(config, cells):
-    return to_full_torus(window_levels(config, cells.pose.dtype), cells.activity)
-
-
 def compare(n, motion, recall, energy):
-    """Compares both engines; returns the window levels."""
     moving = NetworkConfig(cells_xy=n)
     dense = moving.model_copy(update={"engine": "dense"})
     (one, pose, spread, outcome, level), (all_, whole_pose, whole_spread, whole_outcome, whole_level) = (
@@ -245,7 +221,7 @@ def compare(n, motion, recall, energy):
     assert np.nanmax(np.abs(spread - whole_spread)) <= 1e-9
     assert np.array_equal(outcome, whole_outcome)
     assert not np.any(whole_level)
-    gap = full_activity(moving, one) - full_activity(dense, all_)
+    gap = whole(one, moving) - whole(all_, dense)
     assert float(jnp.abs(gap).max()) <= 1e-14
     return level
 
@@ -257,7 +233,6 @@ injection = st.tuples(st.integers(0, 119), *places, st.floats(1e-9, 3))
 @settings(max_examples=3 if settings.default.max_examples < 100 else 30)  # more in the soak
 @given(st.lists(injection, max_size=8), st.floats(-1, 1), st.floats(-1, 1))
 def test_injections_at_any_distance_from_the_packet_are_exact(planted, speed, turn):
-    """Injections across the faces of windows, a few cells from the packet."""
     motion = np.tile([speed, 0.0, turn], (120, 1))
     recall, energy = np.zeros((120, 3)), np.zeros(120)
     for k, x, y, heading, how_much in planted:
@@ -282,15 +257,10 @@ def test_activity_too_large_for_a_level_moves_up(n):
 
 @pytest.mark.parametrize(("away", "exact"), [(2.0, True), (4.5, False), (9.0, False)])
 def test_a_small_window_refuses_a_deposit_near_its_face(away, exact):
-    """The cells excited by a deposit near the face would be lost."""
-    config = NetworkConfig()
-    sizes = window_levels(config, np.dtype(float))
+    sizes, zero = window_levels(CONFIG, np.dtype(float)), jnp.zeros(3)
     pose = jnp.asarray([10.0, 10.0, 18.0])
-    activity = levels.point_activity(sizes, pose)
-    inputs = StepInput(
-        pose, pose + jnp.asarray([away, 0.0, 0.0]), jnp.asarray(0.3), jnp.int32(1), *[jnp.zeros(3)] * 2,
-        jnp.zeros(()),
-    )  # fmt: skip
+    activity, there = hold.point_activity(sizes, pose), pose + jnp.asarray([away, 0.0, 0.0])
+    inputs = StepInput(pose, there, jnp.asarray(0.3), jnp.int32(1), zero, zero, zero[2])
     assert bool(jax.jit(partial(step_at, sizes[0]))(activity.blocks[0], inputs)[2]) == exact
 
 
@@ -309,7 +279,6 @@ def test_wide_kernels_have_wide_margins():
     st.sampled_from([0.05, 0.4, 2.0]),
 )
 def test_many_thousands_of_steps_equal_those_of_the_torus(n, seed, often, speed):
-    """Motion of any size, injections of any energy at any place; without injections one window is enough."""
     stream, steps = np.random.default_rng(seed), 1000
     motion = stream.normal(0, speed, (steps, 3)) * [1, 0.3, 0.5]
     energy = np.where(stream.random(steps) < often, stream.choice([0.02, 0.1, 0.5, 2.0], steps), 0.0)
@@ -317,8 +286,6 @@ def test_many_thousands_of_steps_equal_those_of_the_torus(n, seed, often, speed)
     if often == 0:
         assert not np.any(level)
 
-
-# The probe
 
 WIDE = NetworkConfig(cells_xy=45, cells_heading=72)
 TORUS = (72, 45, 45)
@@ -348,6 +315,7 @@ def test_chosen_and_all_cells_and_sums_are_those_of_the_torus(levels, number):
     assert (torus > 0).any()
     everything = np.arange(len(torus), dtype=np.int32)
     np.testing.assert_array_equal(activity_of(levels, activity, everything), torus)
+    assert activity_of(levels, activity, everything[:0]).shape == (0,)
     chosen = choose_cells(50, TORUS, seed=number)
     np.testing.assert_array_equal(activity_of(levels, activity, chosen), torus[chosen])
     held = jax.device_get(jax.jit(lambda: hold_cells(levels, activity))())
@@ -355,25 +323,18 @@ def test_chosen_and_all_cells_and_sums_are_those_of_the_torus(levels, number):
     assert (active > 0).all()
     np.testing.assert_allclose(np.bincount(cell, active, len(torus)), torus, rtol=1e-6)
     if levels is LEVELS:
-        sums = activity_sums(levels, activity)
+        sums = hold.activity_sums(levels, activity)
         np.testing.assert_allclose(sums.xy, full.sum(axis=0), rtol=1e-12)
         np.testing.assert_allclose(sums.heading, full.sum(axis=(1, 2)), rtol=1e-12)
 
 
-def test_no_chosen_cells_give_no_numbers():
-    assert activity_of(LEVELS, random_activity(LEVELS, 0), np.zeros(0, np.int32)).shape == (0,)
-
-
-def test_cells_are_drawn_by_the_seed_without_repetition():
+def test_cells_are_drawn_by_the_seed_without_repetition_and_given_ones_keep_their_order():
     one, again, other = (choose_cells(64, TORUS, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, again)
     assert (one != other).any()
     assert len(np.unique(one)) == 64
     assert one.dtype == np.int32
     np.testing.assert_array_equal(choose_cells(7 * 7 * 8, (8, 7, 7), 0), np.arange(7 * 7 * 8))
-
-
-def test_given_cells_keep_their_order():
     given = ((44, 0, 0), (1, 2, 3), (0, 44, 71))
     heading, y, x = np.unravel_index(choose_cells(given, TORUS, 0), TORUS)
     assert tuple(zip(x.tolist(), y.tolist(), heading.tolist(), strict=True)) == given

@@ -1,7 +1,5 @@
 """A session in a finished grid map: its surfaces, what whiskers would meet there, and its states."""
 
-from __future__ import annotations
-
 import csv
 from typing import NamedTuple
 
@@ -90,7 +88,6 @@ def test_nothing_is_known_outside_the_map():
 
 
 def test_contradictions_count_most():
-    """A contact in free space speaks against a pose more than any agreement speaks for it."""
     odds = counted_agreement()["odds"]
     nowhere = (CROSSINGS - 1) * TIPS
     assert odds[CONTACT, nowhere] < -3
@@ -98,8 +95,6 @@ def test_contradictions_count_most():
     assert odds[CONTACT, TIPS + 2] > 0
     assert np.abs(odds[FREE]).max() < 1
 
-
-# States
 
 NEEDED = 10.0
 SAVED = GridDrawing(np.full((4, 4), 0.5), np.zeros(2), 0.1), np.zeros((3, 3))

@@ -1,19 +1,21 @@
-"""Laws of the grid filter's map: what it keeps, draws and writes; eq. 3 and 4 in the drawn map."""
+"""Laws of the grid filter's map: what it keeps, draws, writes, eq. 3 and 4 in the drawn map; likelihoods and
+footprints as formulas in NumPy, and consequences of printed forms."""
 
-from __future__ import annotations
-
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit, logit
 
+from evaluation.papers.trial_sessions import distinct_cells
 from ratslam.core.estimates import Estimate
-from ratslam.grid import particles
-from ratslam.grid.config import DrawingConfig, GridConfig
+from ratslam.grid import likelihoods, particles
+from ratslam.grid.config import DrawingConfig, GridConfig, LikelihoodConfig
 from ratslam.grid.map import ContactLog, draw_occupancy
 from ratslam.methods.grid import GridEvidence
-from tactile.base.se2 import compose
+from tactile.base.se2 import compose, wrap
 from tactile.base.types import MotionKind
 from tests.helpers.grid_world import TIPS, create, filter_of, report, settings
 
@@ -41,8 +43,8 @@ def random_steps(count, seed=0):
         yield seen, estimate, GridEvidence(ancestor, poses, weights, 1 / (weights**2).sum(), 0)
 
 
-def map_of_steps(steps):
-    grid = BACKEND.new_map()
+def map_of_steps(steps, grid=None):
+    grid = grid or BACKEND.new_map()
     for step in steps:
         grid.update(*step)
     return grid
@@ -77,7 +79,6 @@ def test_reports_without_evidence_are_not_drawn():
 
 
 def test_values_that_are_not_finite_are_not_drawn():
-    """The map ignores the values that the filter ignores."""
     plain = report(0.05, touching=[0, 1], wall=(0.3, 0.1))
     without = report(0.05, touching=[0, 1])
     for odd, same in (
@@ -89,7 +90,6 @@ def test_values_that_are_not_finite_are_not_drawn():
 
 
 def test_the_map_is_drawn_along_the_surviving_paths():
-    """A particle far off that dies out leaves nothing."""
     off = np.tile([0.8, 0.8, 0.0], (COUNT, 1))
     off[2] = [-0.5, 0.0, 0.0]
     estimate, proof = steady(np.zeros(3))
@@ -125,8 +125,7 @@ def test_a_restored_map_continues_bit_for_bit(monkeypatch, levels, stop):
     steps = list(random_steps(50))
     whole, second = map_of_steps(steps), map_of_steps(random_steps(3, seed=7))
     second.restore({name: value.copy() for name, value in map_of_steps(steps[:stop]).arrays().items()})
-    for step in steps[stop:]:
-        second.update(*step)
+    map_of_steps(steps[stop:], second)
     assert second.arrays().keys() == whole.arrays().keys()
     for name, value in whole.arrays().items():
         np.testing.assert_array_equal(value, second.arrays()[name], err_msg=name)
@@ -134,18 +133,6 @@ def test_a_restored_map_continues_bit_for_bit(monkeypatch, levels, stop):
     assert np.array_equal(second.occupancy(), whole.occupancy())
     assert whole.trajectory().shape == (50, 3)
 
-
-def test_reading_the_map_does_not_change_it():
-    steps = list(random_steps(20))
-    first, second = map_of_steps(steps), BACKEND.new_map()
-    for step in steps:
-        second.update(*step)
-        second.trajectory(), second.occupancy(), second.online_trajectory(), second.arrays()
-    assert np.array_equal(first.occupancy(), second.occupancy())
-    assert np.array_equal(first.trajectory(), second.trajectory())
-
-
-# The drawn map
 
 SIDE, MIDDLE = 51, 25
 PAPER = DrawingConfig(contact=0.8, blob_sd=0.05, edge_sd=0.25, edge_sector=np.pi / 12)
@@ -244,7 +231,6 @@ def test_a_wall_replaces_the_blobs_of_its_contacts():
 
 
 def test_a_wall_keeps_the_blob_of_an_earlier_contact():
-    """One that ended before, also where the robot never backs off."""
     log = marks(3, **touching(3, 1, TIPS[1]))
     log.contact[1] = False
     log.wall[2] = [0.25, 0.0]
@@ -269,12 +255,9 @@ def test_invalid_reports_leave_the_map_unchanged():
 
 @pytest.mark.parametrize("side", [1, 4, 50])
 def test_contacts_outside_the_map_are_dropped(side):
-    path = [[3.0, 0.0, 0.0], [-1e3, 1e3, 1.0], [1e9, 0.0, 0.0], [0.0, 0.0, 0.0]]
-    log = marks(4, free=np.ones((4, 4), bool), wall=np.tile([0.3, 0.0], (4, 1)), **touching(4, 0, TIPS[0]))
-    grid = drawn(log, path, side=side)
-    assert grid.shape == (side, side)
-    assert np.isfinite(grid).all()
-    assert drawn(ContactLog(*(rows[:3] for rows in log)), path[:3], side=side) == pytest.approx(PRIOR)
+    path = [[3.0, 0.0, 0.0], [-1e3, 1e3, 1.0], [1e9, 0.0, 0.0]]
+    log = marks(3, free=np.ones((3, 4), bool), wall=np.tile([0.3, 0.0], (3, 1)), **touching(3, 0, TIPS[0]))
+    assert drawn(log, path, side=side) == pytest.approx(np.full((side, side), PRIOR))
 
 
 @given(
@@ -290,8 +273,156 @@ def test_any_contacts_give_a_map_of_probabilities(seed, chances, most, side):
         random.random(count) < 0.2, random.normal(0, 0.2, (count, 4, 2)),
         np.where(random.random((count, 1)) < 0.5, np.nan, random.normal(0, 0.2, (count, 2))),
     )  # fmt: skip
-    contact, free, body = chances
-    some = {"contact": contact, "free": free, "body": body, "max_log_odds": most}
+    some = dict(zip(("contact", "free", "body"), chances, strict=True)) | {"max_log_odds": most}
     config = GridConfig(body=0.12, drawing=PAPER.model_copy(update=some))
     grid = drawn(log, np.cumsum(random.normal(0, 0.1, (count, 3)), axis=0), config=config, side=side)
+    assert grid.shape == (side, side)
     assert ((grid > 0) & (grid < 1)).all()
+
+
+LIKELY = LikelihoodConfig()
+SEGMENTS = 5
+MODELS = {"literal": lambda cell, hits: np.ones(cell.shape[:-1], bool), "distinct": distinct_cells}
+EVIDENCE = st.lists(st.floats(-30, 30), min_size=4, max_size=4)
+AMONG = st.lists(st.booleans(), min_size=4, max_size=4)
+
+free = jax.jit(likelihoods.free_space, static_argnums=0)
+contact = jax.jit(likelihoods.contact, static_argnums=0)
+direction = jax.jit(likelihoods.wall_direction, static_argnums=0)
+weighing = jax.jit(likelihoods.printed_likelihood, static_argnums=0)
+
+
+def printed(model, evidence, cell, hits, alive=None):
+    """[N] log-likelihoods; all whiskers report unless `alive` is given."""
+    alive = np.ones_like(hits) if alive is None else alive
+    return weighing(PRIOR, evidence, hits, MODELS[model](cell, hits) & alive[None, :, None])
+
+
+def by_loops(model, evidence, cell, hits, alive):
+    """Eq. 1 and 2 of one particle, written out."""
+    chance = expit(evidence + logit(PRIOR))
+    product = 1.0
+    for whisker in np.flatnonzero(alive):
+        ends = tuple(cell[whisker, -1])
+        points = range(SEGMENTS)
+        if hits[whisker]:
+            product *= chance[whisker, -1]
+            if model != "literal":
+                points = range(SEGMENTS - 1)
+        passed = set()
+        for k in points:
+            here = tuple(cell[whisker, k])
+            if model == "distinct" and (here in passed or (hits[whisker] and here == ends)):
+                continue
+            passed.add(here)
+            product *= 1 - chance[whisker, k]
+    return product
+
+
+@pytest.mark.parametrize("model", MODELS)
+@given(st.integers(0, 2**32 - 1))
+def test_printed_likelihoods_are_the_products_of_eq_1_and_2(model, seed):
+    stream = np.random.default_rng(seed)
+    evidence = stream.normal(0, 2, (2, 3, SEGMENTS))
+    cell = np.cumsum(stream.integers(0, 2, (2, 3, SEGMENTS, 2)), axis=2).astype(float)
+    for k, c in np.ndindex(2, 3):  # the same cell, the same evidence
+        _, index = np.unique(cell[k, c], axis=0, return_inverse=True)
+        evidence[k, c] = evidence[k, c][index.ravel()]
+    alive = stream.random(3) < 0.8
+    hits = (stream.random(3) < 0.5) & alive
+    logs = printed(model, evidence, cell, hits, alive)
+    expected = [by_loops(model, evidence[k], cell[k], hits, alive) for k in range(2)]
+    assert np.exp(logs) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_certain_cells_leave_printed_likelihoods_finite(model, dtype):
+    cell = np.arange(SEGMENTS, dtype=dtype)[None, None, :, None].repeat(2, 3)
+    for sign in (-1, 1):
+        for hits in (False, True):
+            logs = printed(model, np.full((1, 1, SEGMENTS), sign * 1e4, dtype), cell, np.array([hits]))
+            assert logs.dtype == dtype
+            assert np.isfinite(logs).all()
+
+
+@given(EVIDENCE, AMONG)
+def test_points_multiply_chances_of_no_obstacle_and_contacts_those_of_one_or_of_a_surprise(evidence, among):
+    chance = expit(np.array(evidence) + logit(LIKELY.unexplored))
+    expected = LIKELY.free * np.log1p(-chance) @ np.array(among)
+    assert free(LIKELY, np.array([evidence]), np.array(among)) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    surprise = LIKELY.surprise
+    expected = LIKELY.contact * np.log(surprise + (1 - surprise) * chance) @ np.array(among)
+    assert contact(LIKELY, np.array([evidence]), np.array(among)) == pytest.approx(
+        expected, rel=1e-6, abs=1e-9
+    )
+
+
+def test_unexplored_space_carries_almost_no_evidence():
+    assert -0.03 < free(LIKELY, np.zeros((1, 17)), np.ones(17, bool))[0] < 0
+    assert free(LIKELY, np.zeros((1, 0)), np.zeros(0, bool)) == 0
+    assert contact(LIKELY, np.zeros((1, 0)), np.zeros(0, bool)) == 0
+
+
+@given(st.floats(0, 100), st.floats(-10, 10), st.floats(-10, 10), st.floats(0.01, 9))
+def test_a_direction_is_as_likely_as_its_von_mises_density_with_the_weight_of_the_walls(
+    length, at, angle, precision
+):
+    field = length * np.array([[np.cos(at), np.sin(at)]])
+    known = length / (length + 0.5)
+    density = np.sqrt(2 * np.pi * max(precision, 0.16)) * np.exp(precision * (np.cos(angle - at) - 1))
+    expected = np.log(1 - LIKELY.wall * known + LIKELY.wall * known * density)
+    found = direction(LIKELY, field, np.array([angle]), jnp.asarray(precision))
+    assert found == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+SIZE = 31
+PLACE = st.tuples(*[st.floats(10, 20)] * 2)
+ANGLE = st.floats(-10, 10)
+FAN = np.pi / 12
+
+blobs = jax.jit(likelihoods.gaussian_blobs, static_argnums=(2, 3))
+disc = jax.jit(likelihoods.disc, static_argnums=2)
+edge = jax.jit(lambda place, angle: likelihoods.wall_edge(place, angle, 4.0, 1.2, SIZE))
+sector = jax.jit(lambda place, angle: likelihoods.wall_sector(place, angle, 5.0, FAN, SIZE))
+
+
+def offsets(place):
+    """To the right [1, SIZE] and up [SIZE, 1] of a place, cells."""
+    at = np.arange(SIZE)
+    return at[None] - place[0], at[:, None] - place[1]
+
+
+@given(st.lists(PLACE, min_size=3, max_size=3), st.lists(st.floats(-3, 3), min_size=3, max_size=3))
+def test_blobs_are_sums_of_round_gaussians(places, amounts):
+    expected = np.zeros((SIZE, SIZE))
+    for place, amount in zip(places, amounts, strict=True):
+        right, up = offsets(place)
+        expected += amount * np.exp(-(right**2 + up**2) / (2 * 1.5**2))
+    found = np.asarray(blobs(np.array([places, places[::-1]]), np.array(amounts), 1.5, SIZE))
+    assert found[0] == pytest.approx(expected, abs=1e-12)
+    assert not np.any(blobs(np.zeros((4, 0, 2)), np.zeros(0), 1.0, SIZE))
+
+
+@given(PLACE, st.floats(1.0, 6.0))
+def test_a_disc_is_full_inside_and_falls_over_a_cell_at_its_rim(place, radius):
+    away = np.hypot(*offsets(place))
+    found = disc(np.array([place]), radius, SIZE)[0]
+    assert found == pytest.approx(np.clip(radius + 0.5 - away, 0, 1), abs=1e-12)
+
+
+@given(PLACE, ANGLE)
+def test_an_edge_is_a_gaussian_along_the_wall(place, angle):
+    right, up = offsets(place)
+    along, across = np.cos(angle) * right + np.sin(angle) * up, np.cos(angle) * up - np.sin(angle) * right
+    expected = np.exp(-(along**2) / (2 * 4.0**2) - across**2 / (2 * 1.2**2))
+    assert edge(np.array([place]), np.array([angle]))[0] == pytest.approx(expected, abs=1e-12)
+
+
+@given(st.one_of(PLACE, st.just((15.0, 15.0))), ANGLE)
+def test_eq_4_draws_the_edge_both_ways(place, angle):
+    right, up = offsets(place)
+    away, seen = np.hypot(right, up), np.arctan2(up, right)
+    off = np.minimum(np.abs(wrap(seen - angle)), np.abs(wrap(seen - angle + np.pi)))
+    expected = np.exp(-(away**2) / (2 * 5.0**2) - np.where(away > 0, off, 0.0) ** 2 / (2 * FAN**2))
+    assert sector(np.array([place]), np.array([angle]))[0] == pytest.approx(expected, abs=1e-9)

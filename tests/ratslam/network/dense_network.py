@@ -4,8 +4,6 @@ States are the pose cells and novelty; every pose cell goes to the view cells th
 to novelty. Nothing here comes from `ratslam.network` but its records.
 """
 
-from __future__ import annotations
-
 from functools import cache, partial
 from typing import NamedTuple
 
@@ -44,15 +42,11 @@ def cells_at(poses, used=None):
     return ViewCells(*(jnp.asarray(value, jnp.float32) for value in values))
 
 
-def silent(shape, views):
-    """A belief that is all novelty."""
-    return Belief(jnp.zeros(shape, jnp.float32), jnp.zeros(views, jnp.float32))
-
-
 def held(network, shape, poses, mass, used=None):
     """The belief that view cells at poses [S, C, 3] of mass [S, C] give."""
     mass = jnp.asarray(mass, jnp.float32)
-    return anchored(network)(silent(shape, mass.shape), cells_at(poses, used), mass)
+    silent = Belief(jnp.zeros(shape, jnp.float32), jnp.zeros_like(mass))
+    return anchored(network)(silent, cells_at(poses, used), mass)
 
 
 @cache
@@ -100,12 +94,9 @@ def tie_matrix(network, shape, poses, used):
     """[H, Y, X, S C] the trilinear shares of pose cells at poses [S, C, 3]."""
     x, y, heading = np.moveaxis(poses, -1, 0)
     sizes = 2 * np.pi / shape[0], network.cells.cell_size, network.cells.cell_size
-    hats = [
-        np.maximum(1 - apart(value / size, cells), 0)
-        for value, size, cells in zip((heading, y, x), sizes, shape, strict=True)
-    ]
-    joined = np.einsum("hsc,ysc,xsc->hyxsc", *hats) * used
-    return joined.reshape(*shape, -1)
+    around = zip((heading, y, x), sizes, shape, strict=True)
+    hats = [np.maximum(1 - apart(value / size, cells), 0) for value, size, cells in around]
+    return (np.einsum("hsc,ysc,xsc->hyxsc", *hats) * used).reshape(*shape, -1)
 
 
 def excited(network, activity):

@@ -1,7 +1,5 @@
 """New files and folders: checked before the work, never in the place of another, whole or not at all."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path
@@ -9,36 +7,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile.base import files
 from tactile.base.errors import InputError
-from tactile.base.files import (
-    flush_to_disk,
-    make_new_file,
-    new_folder,
-    require_new_file,
-    require_own_folder,
-    require_writable,
-    write_atomically,
-    write_text_atomically,
-)
 from tactile.base.random_streams import stream
 from tactile.base.samples import robust_sd, true_runs
 
 
-def names(folder: Path) -> set[str]:
+def names(folder):
     return {path.name for path in folder.iterdir()}
 
 
-def test_what_cannot_be_made_is_refused_by_its_own_name(tmp_path: Path, monkeypatch) -> None:
+def raising(code):
+    def refuse(*path):
+        raise OSError(code, os.strerror(code), *map(str, path[:1]))
+
+    return refuse
+
+
+def test_what_cannot_be_made_is_refused_by_its_own_name(tmp_path, monkeypatch):
     file, link, new = tmp_path / "file", tmp_path / "link", tmp_path / "new"
     file.touch()
     link.symlink_to("nowhere")
     long = tmp_path / ("n" * 300)
-
-    def deny(path: Path, *_: object) -> None:
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-
-    require_new_file(new)
-    require_writable(file)
+    files.require_new_file(new)
+    files.require_writable(file)
     for path, message in (
         (file, f"{file}: exists already"),
         (link, f"{link}: a link to nowhere"),
@@ -49,124 +41,117 @@ def test_what_cannot_be_made_is_refused_by_its_own_name(tmp_path: Path, monkeypa
     ):
         with monkeypatch.context() as patch:
             if path == new:
-                patch.setattr(Path, "touch", deny)
+                patch.setattr(Path, "touch", raising(errno.EACCES))
             with pytest.raises(InputError) as caught:
-                require_new_file(path)
+                files.require_new_file(path)
         assert str(caught.value).startswith(message)
     assert names(tmp_path) == {"file", "link"}
 
 
-def test_a_folder_that_the_same_command_made_goes_on(tmp_path: Path) -> None:
+def test_a_folder_that_the_same_command_made_goes_on(tmp_path):
     own, other = tmp_path / "own", tmp_path / "other"
     for folder in (own, other):
-        require_own_folder(folder, ["runs.jsonl"])
+        files.require_own_folder(folder, ["runs.jsonl"])
         folder.mkdir()
-        require_own_folder(folder, ["runs.jsonl"])
+        files.require_own_folder(folder, ["runs.jsonl"])
     (own / "runs.jsonl").touch()
     (other / "table.csv").touch()
-    require_own_folder(own, ["runs.jsonl"])
+    files.require_own_folder(own, ["runs.jsonl"])
     with pytest.raises(InputError, match=r"other: a folder with other files, such as table\.csv"):
-        require_own_folder(other, ["runs.jsonl"])
+        files.require_own_folder(other, ["runs.jsonl"])
     (own / "table.csv").symlink_to(other / "table.csv")
     with pytest.raises(InputError, match=r"own/table\.csv: a link or a device"):
-        require_own_folder(own, ["runs.jsonl"])
+        files.require_own_folder(own, ["runs.jsonl"])
 
 
-def test_a_file_that_appears_meanwhile_stays(tmp_path: Path, monkeypatch) -> None:
+def test_a_file_that_appears_meanwhile_stays(tmp_path, monkeypatch):
     path = tmp_path / "new"
 
-    def write(temporary: Path) -> None:
+    def write(temporary):
         temporary.write_text("ours")
         path.write_text("theirs")
 
-    def not_supported(*_: object) -> None:
-        raise OSError(errno.EPERM, os.strerror(errno.EPERM))
-
     with pytest.raises(InputError, match="meanwhile"):
-        make_new_file(path, write)
-    monkeypatch.setattr(os, "link", not_supported)
+        files.make_new_file(path, write)
+    monkeypatch.setattr(os, "link", raising(errno.EPERM))
     with pytest.raises(InputError, match="meanwhile"):
-        make_new_file(path, write)
+        files.make_new_file(path, write)
     assert path.read_text() == "theirs"
-    make_new_file(tmp_path / "more", lambda temporary: temporary.write_text("ours"))
+    files.make_new_file(tmp_path / "more", lambda temporary: temporary.write_text("ours"))
     assert names(tmp_path) == {"new", "more"}
 
 
-@pytest.mark.parametrize("kind", ["folder", "file", "link"])
-def test_a_folder_appears_whole_and_does_not_replace_what_appears_meanwhile(
-    kind: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(
+    "appear",
+    [lambda new: (new / "b").mkdir(parents=True), Path.touch, lambda new: new.symlink_to("nowhere")],
+    ids=["folder", "file", "link"],
+)
+def test_a_folder_appears_whole_and_does_not_replace_what_appears_meanwhile(appear, tmp_path):
     path, whole = tmp_path / "new", tmp_path / "whole"
 
-    def make() -> None:
-        with new_folder(path) as folder:
+    def make():
+        with files.new_folder(path) as folder:
             (folder / "a").write_text("ours")
-            if kind == "folder":
-                path.mkdir()
-                (path / "b").touch()
-            elif kind == "file":
-                path.touch()
-            else:
-                path.symlink_to("nowhere")
+            appear(path)
 
     with pytest.raises(InputError, match="meanwhile"):
         make()
-    with new_folder(whole) as folder:
+    with files.new_folder(whole) as folder:
         (folder / "a").touch()
         assert not whole.exists()
     assert names(whole) == {"a"}
     assert names(tmp_path) == {"new", "whole"}
 
 
-def test_the_temporary_file_is_hidden_and_keeps_suffix_and_mode(tmp_path: Path) -> None:
+def test_the_temporary_file_is_hidden_and_keeps_suffix_and_mode(tmp_path):
     file = tmp_path / "a.png"
     file.touch(0o600)
 
-    def write(path: Path) -> None:
+    def write(path):
         assert path.name.startswith(".")
         assert path.suffix == ".png"
         path.write_bytes(b"1")
-        flush_to_disk(path)
+        files.flush_to_disk(path)
         assert file.read_bytes() == b""
 
-    write_atomically(file, write)
+    files.write_atomically(file, write)
     assert file.read_bytes() == b"1"
     assert file.stat().st_mode & 0o777 == 0o600
     assert names(tmp_path) == {"a.png"}
 
 
-def test_errors_of_writing_leave_the_old_file_and_name_it(tmp_path: Path) -> None:
-    """Not its temporary or source."""
+def test_errors_of_writing_leave_the_old_file_and_name_it(tmp_path):
     path, old = tmp_path / "a", tmp_path / "old"
-    write_text_atomically(old, "old")
+    files.write_text_atomically(old, "old")
 
-    def full(temporary: Path) -> None:
+    def full(temporary):
         raise OSError(errno.ENOSPC, "full", "source", None, str(temporary))
 
-    def unnamed(temporary: Path) -> None:
+    def unnamed(temporary):
         temporary.write_text("half")
         raise OSError(errno.ENOSPC, "full")
 
     for write in (full, unnamed, lambda temporary: (temporary / "b").touch()):
-        for make, file in ((write_atomically, path), (make_new_file, path), (write_atomically, old)):
+        atomically = files.write_atomically
+        for make, file in ((atomically, path), (files.make_new_file, path), (atomically, old)):
             with pytest.raises(OSError, match=r"full|Not a directory|No such file") as caught:
                 make(file, write)
             assert caught.value.filename == str(file)
     with pytest.raises(FileNotFoundError) as missing:
-        make_new_file(path, lambda temporary: (tmp_path / "source").read_bytes())
+        files.make_new_file(path, lambda temporary: (tmp_path / "source").read_bytes())
     assert missing.value.filename == str(tmp_path / "source")
     assert names(tmp_path) == {"old"}
     assert old.read_text() == "old"
 
 
-def test_outliers_change_the_robust_spread_little() -> None:
+def test_outliers_change_the_robust_spread_little():
     deviation = stream(0, "deviation").normal(0.0, [1.0, 3.0], (20_000, 2))
     assert robust_sd(deviation) == pytest.approx([1.0, 3.0], rel=0.03)
     deviation[:2000] += 1e6
     assert robust_sd(deviation) == pytest.approx([1.0, 3.0], rel=0.2)
 
 
-def test_runs_of_true_values_are_half_open_and_reach_both_ends() -> None:
+def test_runs_of_true_values_are_half_open_and_reach_both_ends():
     which = np.array([1, 1, 0, 1, 0, 0, 1, 1], bool)
     assert true_runs(which).tolist() == [[0, 2], [3, 4], [6, 8]]
     assert true_runs(which[:0]).tolist() == true_runs(~which[:2]).tolist() == []

@@ -1,6 +1,5 @@
-"""Geometry of whisker arrays, and whisking control: the effect of contact on the commanded sinusoid."""
-
-from __future__ import annotations
+"""Geometry of whisker arrays, whisking control, and whisker images: pixel values are obstacle heights, 0
+without contact; dead whiskers have no effect."""
 
 import numpy as np
 import pytest
@@ -9,17 +8,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pydantic import ValidationError
 
+from tactile import whisking
 from tactile.base.errors import InputError
-from tactile.base.random_streams import stream
-from tactile.whisker_geometry import Head, HeadConfig, RingConfig, shaft_points, tip_height, ur10_head
-from tactile.whisking import (
-    WhiskingConfig,
-    check_amplitude,
-    initial_drive,
-    neighbour_max,
-    whisk_command,
-    whisk_phase,
-)
+from tactile.base.types import Cycle, Odometry, Whisk
+from tactile.calibration import Calibration
+from tactile.frontend import Frontend, TouchConfig
+from tactile.whisker_geometry import HeadConfig, RingConfig, shaft_points, tip_height, ur10_head
+from tactile.whisker_image import MIN_BRIGHTNESS, ImageConfig, view_shape, whisk_observation, whisker_image
+from tactile.whisking import WhiskingConfig, initial_drive, whisk_command, whisk_phase
 
 RING = {"length": st.floats(0.02, 0.3), "radius": st.floats(0.01, 0.2), "height": st.floats(0.05, 0.5)}
 CONFIGS = st.builds(
@@ -29,11 +25,10 @@ CONFIGS = st.builds(
     whiskers=st.integers(1, 9),
     rings=st.lists(st.builds(RingConfig, **RING), min_size=1, max_size=4).map(tuple),
 )
-HEADS = CONFIGS.map(ur10_head)
 
 
-@given(HEADS, st.integers(0, 2**32 - 1))
-def test_whiskers_keep_their_length_and_swing_at_right_angles(head: Head, seed: int) -> None:
+@given(CONFIGS.map(ur10_head), st.integers(0, 2**32 - 1))
+def test_whiskers_keep_their_length_and_swing_at_right_angles(head, seed):
     for vectors in (head.rest, head.swing):
         assert np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-12)
     assert np.allclose((head.rest * head.swing).sum(axis=1), 0, atol=1e-12)
@@ -43,27 +38,23 @@ def test_whiskers_keep_their_length_and_swing_at_right_angles(head: Head, seed: 
     assert np.allclose(2 * (half - head.base), tips - head.base, atol=1e-12)
 
 
-@given(CONFIGS, st.data())
-def test_protraction_lowers_the_tip_until_it_hangs_down(config: HeadConfig, data: st.DataObject) -> None:
+@given(CONFIGS, arrays(float, 6, elements=st.floats(0, 1), unique=True).map(np.sort))
+def test_protraction_lowers_the_tip_until_it_hangs_down(config, share):
     head = ur10_head(config)
-    share = data.draw(arrays(float, 6, elements=st.floats(0, 1), unique=True).map(np.sort))
-    angle = np.repeat((share * np.radians(config.rest_deg))[:, None], len(head.length), axis=1)
-    heights = tip_height(head, angle)
-    apart = np.diff(share) > 1e-3
+    count, rest = len(head.length), np.radians(config.rest_deg)
+    heights = tip_height(head, np.repeat((share * rest)[:, None], count, axis=1))
     assert (np.diff(heights, axis=0) <= 0).all()
-    assert (np.diff(heights, axis=0)[apart] < 0).all()
-    hanging = tip_height(head, np.full(len(head.length), np.radians(config.rest_deg)))
-    assert np.allclose(hanging, head.base[:, 2] - head.length, atol=1e-12)
+    assert (np.diff(heights, axis=0)[np.diff(share) > 1e-3] < 0).all()
+    assert np.allclose(tip_height(head, np.full(count, rest)), head.base[:, 2] - head.length, atol=1e-12)
 
 
 @given(CONFIGS)
-def test_rings_are_rows_and_directions_columns(config: HeadConfig) -> None:
+def test_rings_are_rows_and_directions_columns(config):
     head = ur10_head(config)
     tips = shaft_points(head, np.zeros(len(head.length)), head.length)
     azimuth = np.arctan2(tips[:, 1], tips[:, 0]).reshape(head.shape)
-    assert np.allclose(np.exp(1j * azimuth), np.exp(1j * azimuth[:1]), atol=1e-9)
-    steps = np.exp(1j * (azimuth - np.radians(config.first_deg)))
-    assert np.allclose(steps, np.exp(2j * np.pi * np.arange(config.whiskers) / config.whiskers), atol=1e-9)
+    first = np.radians(config.first_deg) + 2 * np.pi * np.arange(config.whiskers) / config.whiskers
+    assert np.allclose(np.exp(1j * azimuth), np.exp(1j * first), atol=1e-9)
     radius = np.hypot(*head.base[:, :2].T).reshape(head.shape)
     assert np.allclose(radius.T, [ring.radius for ring in config.rings])
     out = np.hypot(*tips[:, :2].T).reshape(head.shape) - radius
@@ -71,7 +62,7 @@ def test_rings_are_rows_and_directions_columns(config: HeadConfig) -> None:
     assert np.allclose(out.T, lengths * np.sin(np.radians(config.rest_deg)))
 
 
-def test_the_papers_head_and_its_dead_whiskers() -> None:
+def test_the_papers_head_and_its_dead_whiskers():
     head = ur10_head(HeadConfig(dead=(0, 17, 5)))
     assert head.shape == (3, 6)
     assert np.allclose(head.length.reshape(3, 6), [[0.05], [0.11], [0.16]])
@@ -85,10 +76,9 @@ def test_the_papers_head_and_its_dead_whiskers() -> None:
 
 
 SHAPE, THRESHOLD, TOP = (3, 6), np.full(18, 0.04), np.radians(65)
-MODES = st.sampled_from(["open", "rcp", "spread"])
 
 
-def run_cycle(config: WhiskingConfig, y: np.ndarray, rate: float = 2000.0) -> np.ndarray:
+def run_cycle(config, y, rate=2000.0):
     """Commanded protractions [T, ..., W] over one cycle of deflections [T, ..., W]."""
     drive, angles = initial_drive(*y.shape[1:]), []
     for k in range(len(y)):
@@ -97,14 +87,14 @@ def run_cycle(config: WhiskingConfig, y: np.ndarray, rate: float = 2000.0) -> np
     return np.array(angles)
 
 
-def touch(whisker: int, size: float, count: int = 1000, since: int = 200) -> np.ndarray:
+def touch(whisker, size, count=1000, since=200):
     y = np.zeros((count, 18))
     y[since:, whisker] = size
     return y
 
 
-@given(MODES, st.floats(0, 1), st.integers(0, 17))
-def test_contact_changes_only_the_amplitude(mode: str, size: float, whisker: int) -> None:
+@given(st.sampled_from(["open", "rcp", "spread"]), st.floats(0, 1), st.integers(0, 17))
+def test_contact_changes_only_the_amplitude(mode, size, whisker):
     config = WhiskingConfig(mode=mode)
     angles = run_cycle(config, touch(whisker, size, count=100, since=10), rate=200.0)
     free = TOP * whisk_phase(config, np.arange(100) / 200.0)[:, None]
@@ -116,14 +106,14 @@ def test_contact_changes_only_the_amplitude(mode: str, size: float, whisker: int
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_the_reduction_is_gain_times_deflection_above_threshold(sign: int) -> None:
+def test_the_reduction_is_gain_times_deflection_above_threshold(sign):
     config = WhiskingConfig(gain=2.0)
     top = run_cycle(config, touch(4, sign * 0.1))[-1] / whisk_phase(config, 999 / 2000)
     np.testing.assert_allclose(TOP - top[4], 2.0 * 0.06, rtol=1e-6)
     np.testing.assert_allclose(np.delete(top, 4), TOP)
 
 
-def test_the_amplitude_stays_reduced_until_the_cycle_ends() -> None:
+def test_the_amplitude_stays_reduced_until_the_cycle_ends():
     config, y = WhiskingConfig(), touch(0, 0.1)
     y[400:] = 0
     assert run_cycle(config, y)[-1, 0] < TOP - 0.2
@@ -134,21 +124,14 @@ def test_the_amplitude_stays_reduced_until_the_cycle_ends() -> None:
     np.testing.assert_allclose(angle, TOP)
 
 
-def test_the_perturbation_is_the_same_at_any_sample_rate() -> None:
+def test_the_perturbation_is_the_same_at_any_sample_rate():
     coarse = run_cycle(WhiskingConfig(), touch(0, 0.2, 500, 100), 1000.0)[::5]
     fine = run_cycle(WhiskingConfig(), touch(0, 0.2, 2000, 400), 4000.0)[::20]
     np.testing.assert_allclose(coarse, fine, atol=0.02)
 
 
-@pytest.mark.parametrize("mode", ["open", "rcp", "spread"])
-def test_a_batch_of_heads_equals_single_calls(mode: str) -> None:
-    y, config = np.abs(stream(0, "y").standard_normal((100, 3, 18))) * 0.1, WhiskingConfig(mode=mode)
-    apart = np.stack([run_cycle(config, y[:, k], 200.0) for k in range(3)], axis=1)
-    assert np.array_equal(run_cycle(config, y, 200.0), apart)
-
-
 @given(st.integers(0, 17), st.floats(0, 1))
-def test_free_neighbours_follow_by_the_configured_share(whisker: int, follow: float) -> None:
+def test_free_neighbours_follow_by_the_configured_share(whisker, follow):
     config = WhiskingConfig(mode="spread", follow=follow)
     loss = TOP * whisk_phase(config, 59 / 120) - run_cycle(config, touch(whisker, 0.1, 60, 10), 120.0)[-1]
     row, column = divmod(whisker, 6)
@@ -156,11 +139,117 @@ def test_free_neighbours_follow_by_the_configured_share(whisker: int, follow: fl
     for other in set(range(18)) - {whisker}:
         np.testing.assert_allclose(loss[other], follow * loss[whisker] if other in near else 0, atol=1e-12)
     # The ends of a single row are not neighbours.
-    assert neighbour_max(np.array([1.0, 0, 0, 0]), (1, 4)).tolist() == [1, 1, 0, 0]
+    assert whisking.neighbour_max(np.array([1.0, 0, 0, 0]), (1, 4)).tolist() == [1, 1, 0, 0]
 
 
-def test_an_amplitude_above_the_limit_is_refused() -> None:
+def test_an_amplitude_above_the_limit_is_refused():
     head = ur10_head(HeadConfig(limit_deg=70))
-    check_amplitude(WhiskingConfig(amplitude_deg=70), head)
+    whisking.check_amplitude(WhiskingConfig(amplitude_deg=70), head)
     with pytest.raises(InputError, match=r"simulation\.whisking\.amplitude_deg: 80 degrees.*70"):
-        check_amplitude(WhiskingConfig(amplitude_deg=80), head)
+        whisking.check_amplitude(WhiskingConfig(amplitude_deg=80), head)
+
+
+HEAD, ODOMETRY = ur10_head(HeadConfig()), Odometry(0.03, 0.001, 0.02, 1.0)
+IMAGES = st.builds(
+    ImageConfig, transform=st.sampled_from(["max_angle", "contact_angle"]), radial=st.booleans()
+)
+TRUTHS, ANGLES = arrays(bool, 18), arrays(float, 18, elements=st.floats(0, float(TOP)))
+REACHES = arrays(float, 18, elements=st.floats(0, 1))
+WHISKS = st.builds(Whisk, st.just(ODOMETRY), TRUTHS, TRUTHS, ANGLES, TRUTHS, ANGLES, REACHES).map(
+    lambda whisk: whisk._replace(held=whisk.held & whisk.contact)
+)
+
+
+@given(IMAGES, WHISKS)
+def test_exactly_the_whiskers_without_contact_are_0(config, whisk):
+    view = whisker_image(config, HEAD, whisk)
+    assert view.shape == view_shape(config, HEAD) == (3, 6, 2 if config.radial else 1)
+    touching = whisk.contact if config.transform == "contact_angle" else whisk.held
+    bright = np.repeat((touching & whisk.alive)[:, None], view.shape[2], axis=1)
+    assert ((view.reshape(bright.shape) > 0) == bright).all()
+    assert ((view[view > 0] >= MIN_BRIGHTNESS) & (view[view > 0] <= 1)).all()
+
+
+@given(WHISKS)
+def test_pixels_grow_with_the_height(whisk):
+    for transform, touching, angle in (
+        ("contact_angle", whisk.contact, whisk.touched),
+        ("max_angle", whisk.held, whisk.highest),
+    ):
+        config = ImageConfig(transform=transform, tallest=0.06)
+        view = whisker_image(config, HEAD, whisk).reshape(18)
+        high = tip_height(HEAD, angle)
+        graded = touching & whisk.alive & (high > MIN_BRIGHTNESS * 0.06) & (high < 0.06)
+        assert np.allclose(view[graded] * 0.06, high[graded])
+        assert (view[touching & whisk.alive & (high >= 0.06)] == 1).all()
+
+
+@given(IMAGES, WHISKS, st.integers(0, 17))
+def test_a_dead_whisker_has_no_effect(config, whisk, number):
+    alive = whisk.alive.copy()
+    alive[number] = False
+    one = whisk_observation(config, HEAD, whisk._replace(alive=alive))
+    wild = {"contact": True, "touched": 0.7, "held": True, "highest": 0.9, "reach": 0.5}
+    for name, value in wild.items():
+        wild[name] = np.where(np.arange(18) == number, value, getattr(whisk, name))
+    other = whisk_observation(config, HEAD, whisk._replace(alive=alive, **wild))
+    assert (one.view == other.view).all()
+    assert (one.point == other.point).all()
+    assert not one.contact[number]
+    assert not one.alive[number]
+
+
+@given(WHISKS)
+def test_the_observation_has_view_contacts_and_points(whisk):
+    seen = whisk_observation(ImageConfig(), HEAD, whisk)
+    assert seen.odometry == ODOMETRY
+    assert (seen.contact == whisk.contact & whisk.alive).all()
+    along = np.where(whisk.reach > 0, whisk.reach, 1.0) * HEAD.length
+    there = shaft_points(HEAD, whisk.touched, along)[:, :2]
+    assert np.allclose(seen.point, np.where(seen.contact[:, None], there, 0))
+
+
+@given(IMAGES, WHISKS)
+def test_the_front_end_observes_the_image_of_a_whisk(config, whisk):
+    frontend = Frontend(TouchConfig(image=config))
+    assert (frontend.view_shape, frontend.whiskers) == (view_shape(config, HEAD), 18)
+    one, other = frontend.observe(whisk), whisk_observation(config, HEAD, whisk)
+    assert all(np.array_equal(field, same) for field, same in zip(one[1:], other[1:], strict=True))
+    assert frontend.observe(other) is other
+    dead = Frontend(TouchConfig(image=config, head=HeadConfig(dead=(3, 11)))).observe(whisk)
+    lost = np.isin(np.arange(18), [3, 11])
+    assert not (dead.alive | dead.contact)[lost].any()
+    shape = (18, -1)
+    assert np.array_equal(dead.view.reshape(shape), one.view.reshape(shape) * ~lost[:, None])
+    assert bool(one.view_seen) == whisk.alive.any()
+
+
+STILL = np.full((18, 2), 2e-3)
+CALIBRATION = Calibration(0 * STILL, STILL, 20 * STILL, np.full(18, TOP), np.ones(18, bool), 2000.0)
+
+
+def still(count):
+    return Cycle(np.arange(count) / 2000, np.zeros((count, 18)), np.zeros((count, 18, 2)), ODOMETRY)
+
+
+@pytest.mark.parametrize("given", [{}, {"image": {"radial": True, "transform": "max_angle"}}])
+def test_a_dropped_whisk_has_motion_but_no_view(given):
+    frontend = Frontend(TouchConfig.model_validate(given), CALIBRATION)
+    seen, touched = frontend.observe(still(0)), np.linspace(0.1, 0.9, 18)
+    assert tuple(seen.odometry) == tuple(ODOMETRY)
+    # Unread whiskers must not count as free.
+    for part in (seen.view_seen, seen.view, seen.contact, seen.point, seen.wall, seen.alive):
+        assert not np.any(part)
+    flags = touched > 0, touched > 0.5, touched, touched > 0.7
+    full = frontend.observe(Whisk(ODOMETRY, *flags, touched, touched))
+    # One chunk can hold both.
+    for one, other in zip([*seen.odometry, *seen[1:]], [*full.odometry, *full[1:]], strict=True):
+        assert (np.shape(one), np.asarray(one).dtype) == (np.shape(other), np.asarray(other).dtype)
+
+
+def test_raw_samples_need_a_calibration():
+    with pytest.raises(InputError, match="calibration: raw whisker samples without a calibration"):
+        Frontend(TouchConfig()).observe(still(2000))
+    seen = Frontend(TouchConfig(), CALIBRATION).observe(still(2000))
+    assert seen.view_seen
+    assert (seen.view == 0).all()
