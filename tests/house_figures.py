@@ -1,6 +1,6 @@
 """The house in numbers: how large it is, how many names it has, where it turns in circles.
 
-    python -m tests.house_figures [ROOT ...]           # this checkout, or others, one column each
+    python -m tests.house_figures [ROOT]               # this checkout, or another
     python -m tests.house_figures --list "twin names"  # what one figure counts
 
 Product means the `*.py` files of the four packages, without tests, docs and setup.py. The function of a
@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import ast
 import re
-import tomllib
 from collections import Counter
 from collections.abc import Callable, Collection
 from pathlib import Path, PurePosixPath
@@ -39,12 +38,12 @@ class Source(NamedTuple):
 
 
 class House(NamedTuple):
-    """A checkout: its product files, definitions by place, and lines by (importing, imported module)."""
+    """A checkout: its product files, definitions by place, and pairs (importing, imported module)."""
 
     root: Path
     sources: list[Source]
     definitions: dict[str, Definition]
-    arrows: dict[tuple[str, str], int]
+    arrows: set[tuple[str, str]]
 
 
 def read_house(root: Path) -> House:
@@ -58,17 +57,17 @@ def read_house(root: Path) -> House:
     return House(root, sources, definitions, _arrows(sources))
 
 
-def _arrows(sources: list[Source]) -> dict[tuple[str, str], int]:
+def _arrows(sources: list[Source]) -> set[tuple[str, str]]:
     """All imports, also in functions and for types; `from a import b` is of a.b, or of a if b is a name."""
     modules = {source.module for source in sources}
-    arrows: dict[tuple[str, str], int] = {}
+    arrows = set[tuple[str, str]]()
     for source in sources:
         for node in (node for node in source.nodes if isinstance(node, ast.Import | ast.ImportFrom)):
             above = [*source.path.parts[: -getattr(node, "level", 0)], getattr(node, "module", "")]
             for name in (".".join(filter(None, [*above, alias.name])) for alias in node.names):
                 target = name if name in modules else name.rpartition(".")[0]
                 if target in modules and target != source.module:
-                    arrows.setdefault((source.module, target), node.lineno)
+                    arrows.add((source.module, target))
     return arrows
 
 
@@ -130,23 +129,27 @@ def records(house: House) -> Items:
     return {place: 1 for place, nodes in above.items() if any(mark.search(ast.unparse(n)) for n in nodes)}
 
 
-def private_functions(house: House) -> Items:
-    """Functions and methods with one leading underscore; the size: how often the file's code names them."""
+def named_privately(house: House) -> Items:
+    """Functions and classes with one leading underscore; the size: how often the file's code names them."""
     every = {str(source.path): source.nodes for source in house.sources}
     names = {path: Counter(getattr(n, "id", getattr(n, "attr", "")) for n in every[path]) for path in every}
-    functions = {place: node.name for place, node in house.definitions.items() if isinstance(node, Function)}
-    return {p: names[p.split(":")[0]][name] for p, name in functions.items() if re.match("_[^_]", name)}
+    found = {place: node.name for place, node in house.definitions.items() if re.match("_[^_]", node.name)}
+    return {place: names[place.split(":")[0]][name] for place, name in found.items()}
 
 
-def called_once(house: House) -> Items:
-    """Private functions that the code of their file names once; the size: lines, decorators included."""
-    once = [(place, house.definitions[place]) for place, n in private_functions(house).items() if n == 1]
-    return {p: (f.end_lineno or 0) + 1 - min(n.lineno for n in [f, *f.decorator_list]) for p, f in once}
+def unused_private_names(house: House) -> Items:
+    """Private functions and classes at the top level that the code of their file never names."""
+    named = named_privately(house)
+    return {place: 1 for place in all_names(house) if named.get(place) == 0}
 
 
 def short_and_called_once(house: House) -> Items:
-    """Private functions of at most 8 lines that the code of their file names once."""
-    return {place: lines for place, lines in called_once(house).items() if lines <= 8}
+    """Private functions of at most 8 lines, decorators included, that the code of their file names once."""
+    once = {place: house.definitions[place] for place, n in named_privately(house).items() if n == 1}
+    functions = {place: node for place, node in once.items() if isinstance(node, Function)}
+    first = {p: min(n.lineno for n in [f, *f.decorator_list]) for p, f in functions.items()}
+    lines = {place: (f.end_lineno or 0) + 1 - first[place] for place, f in functions.items()}
+    return {place: number for place, number in lines.items() if number <= 8}
 
 
 def twin_names(house: House) -> Items:
@@ -175,22 +178,6 @@ def _circles(house: House, depth: int) -> Items:
     return {" <-> ".join(sorted(group)): len(group) for group in groups if len(group) > 1}
 
 
-def upward_arrows(house: House) -> Items:
-    """Imports of a layer above or beside the own one; the layers are those of pyproject.toml's contracts."""
-    settings = tomllib.loads((house.root / "pyproject.toml").read_text(encoding="utf-8"))
-    found = {}
-    for contract in settings["tool"]["importlinter"]["contracts"]:
-        for container in contract.get("containers", [""]) if contract["type"] == "layers" else []:
-            layers = enumerate(re.findall(r"\w+", layer) for layer in contract["layers"])
-            floor = {f"{container}.{name}".strip("."): level for level, names in layers for name in names}
-            depth = len(container.split(".")) + 1 if container else 1
-            for (importer, imported), line in house.arrows.items():
-                one, other = (".".join(module.split(".")[:depth]) for module in (importer, imported))
-                if one != other and one in floor and other in floor and floor[other] <= floor[one]:
-                    found[f"{importer}:{line} -> {imported}"] = 1
-    return found
-
-
 class Figure(NamedTuple):
     """What is counted, how the sizes of the items make one number, and the largest that the house allows."""
 
@@ -211,13 +198,11 @@ FIGURES = {
     "public names": Figure(public_names, goal=1900),
     "all names": Figure(all_names, goal=3100),
     "records": Figure(records, goal=350),
-    "private functions": Figure(private_functions),
-    "called once": Figure(called_once),
     "short and called once": Figure(short_and_called_once, goal=60),
+    "unused private names": Figure(unused_private_names, goal=0),
     "twin names": Figure(twin_names, goal=0),
     "module circles": Figure(module_circles, goal=0),
     "room circles": Figure(room_circles, goal=0),
-    "upward arrows": Figure(upward_arrows, goal=0),
 }
 
 
@@ -229,21 +214,18 @@ def count(root: Path) -> dict[str, int]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.house_figures")
-    parser.add_argument("roots", nargs="*", type=Path, default=[Path(__file__).parents[1]], metavar="ROOT")
+    parser.add_argument("root", nargs="?", type=Path, default=Path(__file__).parents[1], metavar="ROOT")
     parser.add_argument("--list", choices=FIGURES, metavar="FIGURE", help="what it counts, largest first")
     arguments = parser.parse_args()
     if arguments.list:
         items = FIGURES[arguments.list].items
-        print(items.__doc__)
-        for root in arguments.roots:
-            listed = sorted(items(read_house(root)).items(), key=lambda item: (-item[1], item[0]))
-            print("\n".join(f"{size:7,}  {item}" for item, size in listed))
+        listed = sorted(items(read_house(arguments.root)).items(), key=lambda item: (-item[1], item[0]))
+        print(items.__doc__, *(f"{size:7,}  {item}" for item, size in listed), sep="\n")
         return
-    columns = {root.resolve(): count(root) for root in arguments.roots}
-    print(f"{'figure':24}" + "".join(f"{root.name:>10}" for root in columns) + f"{'at most':>10}")
-    for name, figure in FIGURES.items():
-        numbers = "".join(f"{column[name]:10,}" for column in columns.values())
-        print(f"{name:24}{numbers}{'' if figure.goal is None else figure.goal:>10}".rstrip())
+    print(f"{'figure':24}{'number':>10}{'at most':>10}")
+    for name, number in count(arguments.root).items():
+        goal = FIGURES[name].goal
+        print(f"{name:24}{number:10,}{'' if goal is None else goal:>10}".rstrip())
 
 
 if __name__ == "__main__":

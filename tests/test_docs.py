@@ -1,14 +1,11 @@
 """The READMEs are valid: Python blocks run, commands are accepted, links have targets."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,28 +25,31 @@ READMES = sorted(
 )
 
 
-def blocks(text: str, *languages: str) -> list[str]:
-    """The fenced code blocks of a text in one of the languages."""
-    found = re.findall(r"^```(\w*)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+def read(path):
+    return path.read_text(encoding="utf-8")
+
+
+def blocks(path, *languages):
+    """The fenced code blocks of a README in one of the languages."""
+    found = re.findall(r"^```(\w*)\n(.*?)^```", read(path), re.MULTILINE | re.DOTALL)
     return [body for language, body in found if language in languages]
 
 
 PROGRAMS = ("python -m ", "make ", "pip ")
 
 
-def commands(path: Path) -> Iterator[str]:
+def commands(path):
     """Commands in a README, a continued one as one line, comments removed."""
-    for block in blocks(path.read_text(encoding="utf-8"), "", "sh", "bash"):
+    for block in blocks(path, "", "sh", "bash"):
         for line in block.replace("\\\n", "").splitlines():
             if line.startswith(PROGRAMS):
                 yield re.split(r"\s+#", line)[0]
 
 
-def name(path: Path) -> str:
+def name(path):
     return path.relative_to(ROOT).as_posix()
 
 
-PYTHON = [path for path in READMES if blocks(path.read_text(encoding="utf-8"), "python")]
 COMMANDS = [command for path in READMES for command in commands(path)]
 MARKED = {
     "robot": (
@@ -72,11 +72,11 @@ SLOW = (
 """Commands that take longest: for `make soak`."""
 
 
-def begins(command: str, starts: tuple[str, ...]) -> bool:
+def begins(command, starts):
     return command.removeprefix("python -m ").removeprefix("ratslam ").startswith(starts)
 
 
-def is_marked(command: str) -> bool:
+def is_marked(command):
     return any(begins(command, starts) for starts in MARKED.values())
 
 
@@ -88,20 +88,21 @@ LONG = {
 """READMEs whose blocks take longest, on parts that have tests of their own: for `make soak`."""
 
 
-@pytest.mark.parametrize(
-    "readme",
-    [
-        pytest.param(path, marks=pytest.mark.soak if name(path) in LONG else (), id=name(path))
-        for path in PYTHON
-    ],
-)
-def test_python_blocks_run(readme: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+PYTHON = [
+    pytest.param(path, marks=pytest.mark.soak if name(path) in LONG else (), id=name(path))
+    for path in READMES
+    if blocks(path, "python")
+]
+
+
+@pytest.mark.parametrize("readme", PYTHON)
+def test_python_blocks_run(readme, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # blocks may write files
-    for block in blocks(readme.read_text(encoding="utf-8"), "python"):
+    for block in blocks(readme, "python"):
         exec(compile(block, name(readme), "exec"), {"__name__": "__main__"})
 
 
-def test_commands_are_valid() -> None:
+def test_commands_are_valid():
     """Options and names, and of a packaged configuration also what `--set` sets."""
     for command in COMMANDS:
         if not command.startswith("python -m ratslam ") or "--list" in command:
@@ -121,21 +122,17 @@ MADE: dict[str, Path] = {}
 TYPED = {path: [command for command in commands(path) if not is_marked(command)] for path in READMES}
 
 
-@pytest.mark.parametrize(
-    ("readme", "slow"),
-    [
-        pytest.param(
-            path,
-            slow,
-            marks=(pytest.mark.soak, pytest.mark.timeout(1800)) if slow else (),
-            id=f"{name(path)}{'-all' * slow}",
-        )
-        for path, typed in TYPED.items()
-        for slow in (False, True)
-        if any(begins(command, SLOW) == slow for command in typed)
-    ],
-)
-def test_commands_run(readme: Path, slow: bool, tmp_path: Path, monkeypatch, capsys) -> None:
+ALL = pytest.mark.soak, pytest.mark.timeout(1800)
+TYPING = [
+    pytest.param(path, slow, marks=ALL if slow else (), id=f"{name(path)}{'-all' * slow}")
+    for path, typed in TYPED.items()
+    for slow in (False, True)
+    if any(begins(command, SLOW) == slow for command in typed)
+]
+
+
+@pytest.mark.parametrize(("readme", "slow"), TYPING)
+def test_commands_run(readme, slow, tmp_path, monkeypatch, capsys):
     """In a new folder, one after another, as a reader would type them; equal runs are made once."""
     monkeypatch.chdir(tmp_path)
     for command in TYPED[readme]:
@@ -160,64 +157,62 @@ def test_commands_run(readme: Path, slow: bool, tmp_path: Path, monkeypatch, cap
             MADE[command] = tmp_path / output
 
 
-def test_settings_are_valid() -> None:
+def test_settings_are_valid():
     for path in READMES:
-        for text in blocks(path.read_text(encoding="utf-8"), "yaml"):
+        for text in blocks(path, "yaml"):
+            settings = parse(text.replace("whisker_maze.yaml", "whisker_maze"), name(path))
             if "studies" in name(path):
-                text = text.replace("whisker_maze.yaml", "whisker_maze")
-                check_study("study", parse(text, name(path)), ROOT)
+                check_study("study", settings, ROOT)
             else:
-                validate(parse(text, name(path)), LoopConfig)
+                validate(settings, LoopConfig)
 
 
-def test_every_block_is_tried() -> None:
+def test_every_block_is_tried():
     """Prose (text), a table of numbers and an entry point are the only blocks of other kinds."""
     known = {"", "sh", "bash", "python", "yaml", "text", "toml"}
     for path in READMES:
-        text = path.read_text(encoding="utf-8")
-        assert set(re.findall(r"^```(\w+)$", text, re.MULTILINE)) <= known, path
-        for block in blocks(text, "", "sh", "bash"):
+        assert set(re.findall(r"^```(\w+)$", read(path), re.MULTILINE)) <= known, path
+        for block in blocks(path, "", "sh", "bash"):
             lines = [line for line in block.splitlines() if line.startswith(PROGRAMS)]
             assert lines or block.startswith("t,vx"), block
     every = [start for starts in MARKED.values() for start in starts]
     assert all(any(begins(command, (start,)) for command in COMMANDS) for start in every)
 
 
-def test_links_have_targets() -> None:
+def test_links_have_targets():
     missing = []
     for readme in READMES:
-        text = re.sub(r"^```.*?^```", "", readme.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        text = re.sub(r"^```.*?^```", "", read(readme), flags=re.MULTILINE | re.DOTALL)
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
             if not re.match(r"\w+:", target) and not (readme.parent / target).exists():
                 missing.append((name(readme), target))
     assert missing == []
 
 
-def test_files_of_the_equations_exist() -> None:
-    text = (ROOT / "evaluation" / "RESULTS.md").read_text(encoding="utf-8")
+def test_files_of_the_equations_exist():
+    text = read(ROOT / "evaluation" / "RESULTS.md")
     files = re.findall(r"`([\w/]+(?:\.py|/))`", text[text.index("## Equations and files") :])
     assert len(files) > 20
     assert [file for file in files if not (ROOT / file).exists()] == []
 
 
-def test_settings_named_for_users_of_openratslam_exist() -> None:
-    text = (ROOT / "docs" / "coming_from_openratslam.md").read_text(encoding="utf-8")
-    (content,) = blocks(text, "yaml")
-    settings = parse(content, "irat.yaml")
-    camera = override(settings, ["recording.visual_odometry.fov_deg=60"])  # its settings are in the table too
-    config = validate(camera, RunConfig)
+def test_settings_named_for_users_of_openratslam_exist():
+    page = ROOT / "docs" / "coming_from_openratslam.md"
+    text, (content,) = read(page), blocks(page, "yaml")
+    camera = ["recording.visual_odometry.fov_deg=60"]  # its settings are in the table too
+    config = validate(override(parse(content, "irat.yaml"), camera), RunConfig)
     table = text[text.index("## Parameters") : text.index("## What we do")]
     paths = re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)`", table)
     assert len(paths) > 20
     for path in paths:
-        section: object = config
+        section = config
         for key in path.split("."):
             assert hasattr(section, key), path
             section = getattr(section, key)
 
 
 @pytest.mark.soak
-def test_the_reference_is_built_without_warnings(tmp_path: Path) -> None:
+def test_the_reference_is_built_without_warnings(tmp_path):
     pytest.importorskip("pdoc", reason="of the extra [docs]")
     command = [sys.executable, str(ROOT / "docs" / "reference.py"), str(tmp_path)]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
