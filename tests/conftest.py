@@ -1,7 +1,5 @@
 """Strict numerics for every test, the option for soak tests, and the paths of data."""
 
-from __future__ import annotations
-
 import atexit
 import gc
 import json
@@ -58,7 +56,6 @@ LONGEST = (
     "tests/ratslam/runs/test_recall_maps.py",
     "tests/ratslam/runs/test_touch_maps.py",
     "tests/evaluation/studies/test_study_runner.py",
-    "tests/ratslam/runs/test_carried_robot.py",
     "tests/robot/drivers/ur10/test_arm.py",
     "tests/ratslam/mapping/test_closure_odds.py",
     "tests/robot/drivers/create/test_driver.py",

@@ -7,8 +7,6 @@ Product means the `*.py` files of the four packages, without tests, docs and set
 figure returns what it counts (files, functions, groups of modules), each item with its size.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import re

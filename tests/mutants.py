@@ -11,8 +11,6 @@ reach its line. Coverage does not see compiled functions or child processes: for
 and for files with jax or numba, all tests that import the file run, too.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import json

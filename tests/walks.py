@@ -7,8 +7,6 @@ passed when one of its functions is called; a return is a call from another file
 same return counts once, so that a loop over samples is no long walk.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Callable

@@ -4,8 +4,6 @@
 sessions again.
 """
 
-from __future__ import annotations
-
 import json
 from itertools import groupby
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs commands of the program one after the other in another process, within bounds of time and memory."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

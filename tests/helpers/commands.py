@@ -1,7 +1,5 @@
 """Commands of the program, run in this process: what they print, and how they refuse."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -5,8 +5,6 @@ image is one ray against the walls; rows follow from the distance. A panorama is
 the other camera a pinhole.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Installed packages made on the fly: a module and its metadata in a folder for `sys.path`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

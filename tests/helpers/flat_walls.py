@@ -1,7 +1,5 @@
 """Made-up strain of four tapered whiskers against flat walls and posts, in closed form, no simulator."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tactile.base.types import MotionKind, Odometry, Report, StepEnd

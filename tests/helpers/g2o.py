@@ -1,7 +1,5 @@
 """Reads the g2o files that the package writes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

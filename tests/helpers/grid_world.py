@@ -1,7 +1,5 @@
 """Shared by tests of the grid filter: the whiskers of a Create, simple reports, and a driver."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache, partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Sessions on laps around a square, made up."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from evaluation.studies.metrics import SessionResult

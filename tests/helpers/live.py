@@ -1,7 +1,5 @@
 """Shared by tests of live parts: emulator processes, their fault ports, and waiting for a condition."""
 
-from __future__ import annotations
-
 import json
 import socket
 import subprocess

@@ -1,7 +1,5 @@
 """Bags written with the writers of rosbags: ROS 1, and ROS 2 as sqlite3 or MCAP, compressed or not."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

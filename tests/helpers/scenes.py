@@ -5,8 +5,6 @@ neighbours are as different as any. Odometry has noise, a scale error of its tur
 traces have.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files spoilt at random: bytes, cells of tables, values of JSON, YAML and settings, arrays."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The run of `configs/square.yaml`, which the workers of a test session make once."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

@@ -5,8 +5,6 @@ with `STIFFNESS` per radian. Both sensors sample these forces at a rate of their
 that of the head, in equal parts for the samples between two whisks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

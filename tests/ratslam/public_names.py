@@ -1,7 +1,5 @@
 """Uses every public name of `ratslam`; `make lint` checks it as users check their own code."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

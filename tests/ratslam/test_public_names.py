@@ -1,7 +1,5 @@
 """The public names: they exist, are typed, are listed, and nothing else is."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fixtures of the tests of `robot`: traces, and a check of errors in user input."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

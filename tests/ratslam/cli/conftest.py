@@ -1,7 +1,5 @@
 """A finished run, a copy for each module."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.helpers.square_run import copy_square_run

@@ -3,8 +3,6 @@
 No traceback, no minute without a word, at most 2 GB, no wrong map without a warning, no file left behind.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import shutil

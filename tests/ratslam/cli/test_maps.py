@@ -1,7 +1,5 @@
 """Saved maps by command: map and path; `localise` in maps of views, whiskers and a grid."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

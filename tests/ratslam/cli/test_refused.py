@@ -1,8 +1,6 @@
 """What ends a command with code 2: a wrong path, argument, configuration or recording, which its error names;
 an output that is there already, or a disk that is full."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shlex

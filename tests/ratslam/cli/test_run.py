@@ -1,7 +1,5 @@
 """Help, version and schema; the commands run, score and simulate: files, repeats, repaired recordings."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Stopped runs are scored or readable, and continue; a stopped undo is none, or can be completed."""
 
-from __future__ import annotations
-
 import errno
 import gc
 import json

@@ -1,7 +1,5 @@
 """The run monitor on a run in progress, a finished and a killed one; it changes nothing in the run."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The core: sessions that start again and grow, arrays that grow, packed records, and the compiler."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

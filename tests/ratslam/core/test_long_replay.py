@@ -4,8 +4,6 @@
 classic backend into a run directory, as `ratslam run` does, and prints its memory.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

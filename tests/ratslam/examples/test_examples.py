@@ -1,7 +1,5 @@
 """The examples run as programs and print what they say; one as a package, and packages that are broken."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -1,7 +1,5 @@
 """Emulated robots, each in processes of its own, and quick sessions on them."""
 
-from __future__ import annotations
-
 import json
 import re
 import time

@@ -1,7 +1,5 @@
 """Emulators for each module, reset before each test, and a server that starts sessions for all modules."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """Sessions that a server forks: processes, output, files, the content of a recording."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -6,8 +6,6 @@ takes for a sample (`mapper`, s; null for no stub), whether the self-test checks
 (`rate_check`), and variables of its `environment`.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Sessions of an arm with a head: faults of arm, mapper and head, kills and interrupts, localisation."""
 
-from __future__ import annotations
-
 import csv
 import os
 import resource

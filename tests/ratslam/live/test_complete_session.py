@@ -1,7 +1,5 @@
 """A session as in the README, by the program: emulators, `live`, and `run` on the recording."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -4,8 +4,6 @@
 for each fault: outcome, and the time until the wheels stood, by the robot's own log.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

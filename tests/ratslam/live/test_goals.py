@@ -1,7 +1,5 @@
 """Drives to goals: legs, states, contacts, missing estimates; of an arm in virtual time, and live."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from itertools import chain, pairwise, repeat

@@ -1,7 +1,5 @@
 """Sessions that are refused: the error has a cure, and nothing moves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A wide circle that a robot drives again and again, with recall written by hand."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 
 import numpy as np

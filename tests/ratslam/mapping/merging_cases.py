@@ -1,7 +1,5 @@
 """Routes that a robot drives again and again, with recall written by hand that follows the map's merges."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Laps with closures for the optimiser, and its residuals by finite differences."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ratslam.mapping.optimizer import CalibrationPrior, LoopClosures, MapFit, OdometryChain

@@ -1,7 +1,5 @@
 """Worlds to select closure sequences from: laps with noise, true sequences and a false one."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import NamedTuple
 

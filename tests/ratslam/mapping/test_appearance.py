@@ -1,7 +1,5 @@
 """Views of keyframes: misfits, log-odds of one place, metrics learned from a session, and restored state."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The calibration and noise of odometry that a map learns, errs by as it says, and starts a session from."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import yaml

@@ -1,7 +1,5 @@
 """The final map of a robot that may be carried: views at its own keyframes, tracks, retracing, closures."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

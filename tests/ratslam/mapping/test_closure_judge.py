@@ -1,7 +1,5 @@
 """Whether closures and maps are believed, on laps with true and false closures, whatever the sensor."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

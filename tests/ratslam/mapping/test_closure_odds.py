@@ -1,7 +1,5 @@
 """Acceptance of closure sequences by their odds; scan, vote and null of scores equal slow sums."""
 
-from __future__ import annotations
-
 from functools import cache
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Selection of closures of the least cost, with cuts and afresh; several maps find what one alone cannot."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

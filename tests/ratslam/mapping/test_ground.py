@@ -1,7 +1,5 @@
 """The ground of known keyframes, the odds of gains on it, and poses that follow odometry over it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Maps whose keyframes are merged while a robot drives a circle, or on ground that is wrong at first."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

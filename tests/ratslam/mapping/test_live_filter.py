@@ -1,7 +1,5 @@
 """The live filter is least squares over keyframes since the map is known; steps are relative to keyframes."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from types import SimpleNamespace
 

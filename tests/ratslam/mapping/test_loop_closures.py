@@ -1,7 +1,5 @@
 """Laws of the closure log: candidates, verdicts, accepted closures, merged keyframes and restored state."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Which keyframes are merged, and with which; of their odometry nothing is lost and nothing counted twice."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

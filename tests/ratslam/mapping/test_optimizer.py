@@ -1,7 +1,5 @@
 """Laws of the solvers of maps and of pose graphs by dense algebra, and maps written and read back."""
 
-from __future__ import annotations
-
 import warnings
 
 import networkx

@@ -1,7 +1,5 @@
 """Pieces of a map: where they lie, what joins and what parts them; experiences: groups of keyframes."""
 
-from __future__ import annotations
-
 import networkx
 import numpy as np
 import pytest

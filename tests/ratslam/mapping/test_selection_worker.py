@@ -1,7 +1,5 @@
 """Selection beside the session: its result is taken up at a fixed keyframe, however long it takes."""
 
-from __future__ import annotations
-
 from threading import Event
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Our backends pass the conformance checks; and what they do in the walks of the checks."""
 
-from __future__ import annotations
-
 import os
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The grid filter as a backend: evidence in its maps, weights, resampling, bad input, whole sessions."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax

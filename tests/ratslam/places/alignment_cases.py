@@ -1,7 +1,5 @@
 """Random poses and motions, and a loop of keyframes that all look different."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Changed places are named, and no others: contacts laid over those of a map, their signs, and sessions."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """Pose hypotheses have to explain a session from its start; the log-odds of gains in a map, by itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 

@@ -1,7 +1,5 @@
 """A session is found in a finished map, lost where it is carried away, and not found elsewhere."""
 
-from __future__ import annotations
-
 import csv
 from collections import namedtuple
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Placements of a session on a ring of keyframes whose views are made up; a solved piece is a rigid body."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Ways over the experience graph: the laws of a shortest way, in both modes."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import networkx

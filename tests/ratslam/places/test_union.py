@@ -1,7 +1,5 @@
 """Two maps: their difference, common sessions, what each keeps in a united one; what a crop leaves."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Memories, beliefs and random cases for recall."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import jax

@@ -1,7 +1,5 @@
 """The recall filter equals explicit loops; laws of its posterior, and what views and ids tell it."""
 
-from __future__ import annotations
-
 import math
 
 import jax

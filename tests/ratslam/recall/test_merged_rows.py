@@ -1,7 +1,5 @@
 """Rows of the recall memory after keyframes were merged or restored."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Laws of recall by whisker images, of their levels, and of their likelihood by slow sums over the pixels."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

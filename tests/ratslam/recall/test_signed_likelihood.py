@@ -1,7 +1,5 @@
 """Laws of the log-odds of signed images, and what they tell apart."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import jax

@@ -1,7 +1,5 @@
 """Recorded pose cells: those of the network of both methods, the same bits of all else, Ctrl-C, refusals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Runs that go on from a map after another recording: none of their samples is left out or mapped twice."""
 
-from __future__ import annotations
-
 import json
 import signal
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Map files of every format that was ever written: each is opened, continued and compared."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Saved maps merged into one; killed merges; maps of a building whose places have given ids."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Other touch sensors map a maze by configuration and plug-in alone; a rat in a box; a camera alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Whole maps by recall: sequences that classic matching distorts are mapped, ambiguous ones stay odometry; a
 map that is likely wrong gives odometry as its best estimate."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache

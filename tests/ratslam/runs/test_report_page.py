@@ -1,7 +1,5 @@
 """The report in a real browser: opened from a file, used by mouse, checked by axe."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Map files: one format for runs and loops; refusals of what is spoilt, no map, or of another sensor."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

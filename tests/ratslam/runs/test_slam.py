@@ -1,7 +1,5 @@
 """The program as functions: one's own loop with the bits of a run, and the result of a run."""
 
-from __future__ import annotations
-
 import csv
 import re
 import threading

@@ -1,8 +1,6 @@
 """Whole maps from whisker images of simulated sessions: closures at equal places, and none without them;
 merged keyframes; a robot that is found in such a map; one that was carried."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from functools import cache, partial

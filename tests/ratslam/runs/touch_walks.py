@@ -1,7 +1,5 @@
 """Simulated walks by whisker, and sessions that map them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache, partial
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Frames, arm states and whole sessions for the live recorder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

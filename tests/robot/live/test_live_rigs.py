@@ -1,7 +1,5 @@
 """What a live session measures: the arm's route and odometry, the work of a whisk, strain of a Create."""
 
-from __future__ import annotations
-
 import pickle
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Live recordings are read back exactly: laws, kills, full disks, recovery, damage."""
 
-from __future__ import annotations
-
 import re
 import resource
 import struct

@@ -1,7 +1,5 @@
 """Sources in memory, their motion, corrections, perturbed copies, and controls with other views."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

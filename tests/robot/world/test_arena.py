@@ -1,7 +1,5 @@
 """Arenas: free space, walls and objects, the file format; contact of whiskers with walls in closed form."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

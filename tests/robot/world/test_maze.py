@@ -1,7 +1,5 @@
 """Mazes: random loops, walls as boxes, the file format, routes, and the head's paths along them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise

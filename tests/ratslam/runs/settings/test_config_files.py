@@ -1,7 +1,5 @@
 """Configurations in files: what they include, settings that have moved or differ, names, completion."""
 
-from __future__ import annotations
-
 import re
 from operator import attrgetter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks of sources, touch front ends, backends, metrics: sound ones pass, broken ones are told why."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 from dataclasses import replace
 from enum import IntEnum

@@ -1,7 +1,5 @@
 """The doctor: what a recording holds, what reads it, and whether to believe the map of a run."""
 
-from __future__ import annotations
-
 import json
 import re
 from itertools import islice

@@ -1,7 +1,5 @@
 """Exported files hold what the run holds, and are read back by the tools that they are for."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

@@ -1,7 +1,5 @@
 """`fit` measures wheels, head and signals of a record, and writes what a configuration includes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

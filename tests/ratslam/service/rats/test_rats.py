@@ -1,7 +1,5 @@
 """A RatInABox agent as a source, pose cells as its neurons; spikes: laws, NWB and NumPy files, scores."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 

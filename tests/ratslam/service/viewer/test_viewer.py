@@ -1,7 +1,5 @@
 """The live view: what it shows, and that no viewer changes, delays or ends a run."""
 
-from __future__ import annotations
-
 import csv
 import os
 import signal

@@ -12,8 +12,6 @@ of its own memory (URBs) and reaps them when they are complete; two threads exec
 wait for data and one all others. Memory of the client is accessed only while it waits in an ioctl.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import importlib

@@ -1,7 +1,5 @@
 """Sessions of the Create: reproducibility, statistics; state machine; errors of wheel odometry."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Whiskers among walls: geometry of bending, beam theory, strain sensors; templates of simulated drives."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

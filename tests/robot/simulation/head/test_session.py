@@ -1,7 +1,5 @@
 """Simulated sessions of the head: reproducibility, streams, routes, mazes, recordings, settings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The raw tiers: mechanics compared with theory, agreement; noise and drift; errors of simulated odometry."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

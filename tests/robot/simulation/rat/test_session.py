@@ -1,7 +1,5 @@
 """Sessions of a rat: panoramic views, odometry, phases, errors; paths, their files and random walks."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
