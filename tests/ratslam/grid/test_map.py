@@ -13,6 +13,7 @@ from evaluation.papers.trial_sessions import distinct_cells
 from ratslam.core.estimates import Estimate
 from ratslam.grid import likelihoods, particles
 from ratslam.grid.config import DrawingConfig, GridConfig, LikelihoodConfig
+from ratslam.grid.contact_features import contact_features
 from ratslam.grid.map import ContactLog, draw_occupancy
 from ratslam.methods.grid import GridEvidence
 from tactile.base.se2 import compose, wrap
@@ -246,6 +247,13 @@ def test_continued_contacts_and_contacts_in_turns_leave_no_blob():
     assert drawn(held) == pytest.approx(drawn(once))
     turning = marks(5, turning=np.ones(5, bool), **touching(5, 0, [0.25, 0.1]))
     assert drawn(turning) == pytest.approx(PRIOR)
+
+
+@pytest.mark.parametrize(("motion", "new"), [(MotionKind.FORWARD, False), (MotionKind.OTHER, True)])
+def test_a_whisker_that_stays_in_contact_touches_anew_only_when_it_whisks(motion, new):
+    touched = np.array([False, True, False, False])
+    seen = report(0.1, touching=(0, 1), motion=motion)
+    assert contact_features(seen, touched, np.dtype(float))[1].new.tolist() == [True, new, False, False]
 
 
 def test_invalid_reports_leave_the_map_unchanged():

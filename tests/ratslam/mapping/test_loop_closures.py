@@ -64,6 +64,9 @@ def test_the_log_is_a_list_of_candidates(steps):
     nothing = np.inf, Verdict.UNDONE, 0.0, np.nan
     expected, table = [[*one, of, *(known[of] if of >= 0 else nothing)] for one, of in rows], log.table()
     assert np.array_equal(table, np.reshape(expected, (-1, 10)), equal_nan=True)
+    signs = [[0, 1, -1][known[of][1]] if of >= 0 else -1 for _, of in rows]
+    judged = [[one.match, one.keyframe, sign] for (one, _), sign in zip(rows, signs, strict=True)]
+    assert np.array_equal(log.judged(), np.reshape(judged, (-1, 3)))
 
     closures = log.closures(0.2, VARIANCE, SCALES)
     mine = [rows[k] for k in counts]

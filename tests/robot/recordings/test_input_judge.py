@@ -18,7 +18,7 @@ from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import Stretch
 from robot.sources.odometry import OdometryCorrection, from_poses, from_velocities, replace_steps
 from robot.sources.source import Source
-from tactile.base.errors import InputErrors
+from tactile.base.errors import InputError, InputErrors
 from tactile.base.se2 import between, integrate
 from tests.robot.conftest import SYNTHETIC
 
@@ -347,3 +347,10 @@ def test_a_broken_archive_gives_one_error(stream, tmp_path, refused):
     np.save(tmp_path / "single.npy", np.zeros(3))
     (tmp_path / "single.npy").rename(path)
     refused(lambda: read_trace(path), "cannot be read as .npz", "write it with numpy.savez")
+
+
+def test_a_stretch_without_samples_is_refused():
+    time = np.arange(5.0)
+    assert Stretch(1.0, 3.0).rows(time, "a").tolist() == [False, True, True, True, False]
+    with pytest.raises(InputError, match="nothing from"):
+        Stretch(5.0).rows(time, "a")

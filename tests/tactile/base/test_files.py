@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile.base import files
+from tactile.base import bounded, files
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.samples import robust_sd, true_runs
@@ -155,3 +155,12 @@ def test_runs_of_true_values_are_half_open_and_reach_both_ends():
     which = np.array([1, 1, 0, 1, 0, 0, 1, 1], bool)
     assert true_runs(which).tolist() == [[0, 2], [3, 4], [6, 8]]
     assert true_runs(which[:0]).tolist() == true_runs(~which[:2]).tolist() == []
+
+
+def test_an_archive_that_expands_to_too_much_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    file = tmp_path / "zeros.npz"
+    np.savez_compressed(file, a=np.zeros(1 << 18))
+    monkeypatch.setattr(bounded, "MOST_BYTES", 1 << 20)
+    monkeypatch.setattr("zipfile.ZipFile.read", None)
+    with pytest.raises(InputError, match="expands to"):
+        bounded.read_npz(file, ["a"], np.asarray, "an array")

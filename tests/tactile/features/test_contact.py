@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tactile import contact_stream
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
-from tactile.base.types import Cycle, Odometry
+from tactile.base.types import Cycle, Odometry, Report
 from tactile.calibration import Calibration, FreeBaseline, RestBaseline, RestBaselineConfig, follow_baseline
 from tactile.contact_stream import ContactStreamConfig, Touch, find_contacts, find_fixed_contacts
 from tactile.contact_threshold import ContactConfig, ShaftConfig, detect_contacts, radial_distance, stiffness
@@ -300,3 +300,10 @@ def test_contacts_are_dated_back_to_their_first_row():
     dated = contact_stream.date_back(plan, touch)
     assert np.flatnonzero(dated[:, 0])[[0, -1]].tolist() == [100, 199]
     assert not dated[:, 1].any()
+
+
+def test_a_head_has_no_reports_of_a_create():
+    moved, no = Odometry(0.0, 0.0, 0.0, 0.1), np.zeros(W, bool)
+    reading = Report(moved, 0, 0, ~no, no, np.zeros(0), np.zeros((0, W, 2)))
+    with pytest.raises(InputError, match="reports of a Create"):
+        Frontend(TouchConfig(), FAST).observe(reading)
