@@ -72,6 +72,20 @@ def test_a_file_in_a_missing_folder_or_without_permission_is_refused(tmp_path, r
     refused(lambda: read_bytes(path), str(path), "(Permission denied)", "readable for this user")
 
 
+def test_parts_of_a_recording_lie_in_the_folder_or_beside_it(tmp_path, monkeypatch):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "aces_scans.csv").touch()
+    files = {"views": "*_scans.csv", "pairs": "b.csv", "truth": "/c.csv", "labels": None}
+    parts = {"table": {name: {"file": file} for name, file in files.items()}}
+    config = RecordingConfig.model_validate({"file": "data/aces_odom.csv"} | parts)
+    monkeypatch.chdir(tmp_path)
+    for folder, here in ((tmp_path, ()), (Path("/other"), [("recording", "file")])):
+        found = config.resolved(folder, here, ("recording",))
+        assert found.file == tmp_path / "data" / "aces_odom.csv"
+        found = [getattr(found.table, name).file for name in files]
+        assert found == [tmp_path / "data" / "aces_scans.csv", folder / "b.csv", Path("/c.csv"), None]
+
+
 def test_the_readme_example_runs(tmp_path):
     text = (ROOT / "robot" / "recordings" / "README.md").read_text()
     content = re.search(r"```\n(t,vx,.*?)```", text, re.S)
