@@ -17,7 +17,7 @@ ROOMS = [
 ]
 MOST = {
     "rooms": 30, "folders": 50, "files": 408, "product lines": 76_600, "code lines": 51_720,
-    "test lines": 48_400, "largest file": 600, "longest function": 80, "public names": 1_841,
+    "test lines": 45_300, "largest file": 600, "longest function": 80, "public names": 1_841,
     "all names": 2_940, "records": 300, "short and called once": 55, "unused private names": 0,
     "twin names": 0, "module circles": 0, "room circles": 0,
 }  # fmt: skip
