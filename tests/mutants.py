@@ -8,7 +8,8 @@ A mutant replaces one comparison, operator or constant, or drops one statement. 
 many as the root of its lines. A mutant is named by its file and its line's text, so that it is found again
 after other lines have moved; a mutant whose line is gone is reported as such. Each runs only the tests that
 reach its line. Coverage does not see compiled functions or child processes: for a line that no test reaches,
-and for files with jax or numba, all tests that import the file run, too.
+and for files with jax or numba, all tests that import the file run, too. Without a `.coverage` file the tests
+that import the file run, and the others of its room.
 """
 
 import argparse
@@ -162,19 +163,21 @@ def tests_of(mutant: Mutant, root: Path) -> list[str]:
     """Tests to run: those that reach the line, and where coverage cannot see, files that import its file."""
     from coverage import CoverageData
 
-    data = CoverageData(str(root / ".coverage"))
-    data.read()
+    near, reached = f"tests/{room_of(mutant.file)}/", root / ".coverage"
     text = (root / mutant.file).read_text(encoding="utf-8")
-    rows = [row for row, line in enumerate(text.split("\n"), start=1) if line == mutant.line]
-    contexts = data.contexts_by_lineno(str(root / mutant.file)).get(rows[mutant.nth], [])
-    tests = sorted({context.split("|")[0] for context in contexts if context})
-    if not tests or re.search(r"^\s*(import|from) (jax|numba)", text, re.MULTILINE):
+    files = [str(f.relative_to(root)) for f in sorted((root / "tests").rglob("test_*.py"))]
+    tests = [file for file in files if file.startswith(near)]
+    if reached.exists():
+        data = CoverageData(str(reached))
+        data.read()
+        rows = [row for row, line in enumerate(text.split("\n"), start=1) if line == mutant.line]
+        contexts = data.contexts_by_lineno(str(root / mutant.file)).get(rows[mutant.nth], [])
+        tests = [context.split("|")[0] for context in contexts if context]
+    if not tests or not reached.exists() or re.search(r"^\s*(import|from) (jax|numba)", text, re.MULTILINE):
         module = mutant.file.removesuffix(".py").replace("/", ".")
         room, _, name = module.rpartition(".")
         direct = re.compile(rf"{re.escape(module)}\b|from {re.escape(room)} import [^\n]*\b{name}\b")
-        files = sorted((root / "tests").rglob("test_*.py"))
-        tests += [str(f.relative_to(root)) for f in files if direct.search(f.read_text(encoding="utf-8"))]
-    near = f"tests/{room_of(mutant.file)}/"
+        tests += [file for file in files if direct.search((root / file).read_text(encoding="utf-8"))]
     return sorted(set(tests), key=lambda test: (not test.startswith(near), test))
 
 
