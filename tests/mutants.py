@@ -183,7 +183,8 @@ def tests_of(mutant: Mutant, root: Path) -> list[str]:
 
 def find(mutant: Mutant, root: Path) -> str:
     """The first test that fails with the mutant; "lost", "gone" or "no test" without one."""
-    text = mutated(mutant, (root / mutant.file).read_text(encoding="utf-8"))
+    path = root / mutant.file
+    text = mutated(mutant, path.read_text(encoding="utf-8")) if path.exists() else None
     if text is None:
         return "gone"
     tests = tests_of(mutant, root)
