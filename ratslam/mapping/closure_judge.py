@@ -235,8 +235,10 @@ def _count_views(
         (np.arange(middle, len(path)), [stays, motion[middle + 1 :]], [stays, variance[middle + 1 :]]),
         (np.arange(middle - 1, -1, -1), [back], [variance[middle:0:-1]]),
     ):
-        way_there = frames, np.concatenate(motions), np.concatenate(variances), spread, reach, REACH_HEADING
-        pose, _, best, _ = follow_track(*on, *way_there, EVEN.edges, EVEN.odds, -np.inf, start)
+        moves = np.concatenate(motions), np.concatenate(variances)
+        pose, _, best, _ = follow_track(
+            *on, frames, *moves, spread, reach, REACH_HEADING, EVEN.edges, EVEN.odds, -np.inf, start
+        )
         kinds[frames] = _kinds(*on, frames, pose, best, ground, reach, lag, state.guard)
     within = np.zeros(len(path), bool)
     within[way.first - way.low : way.last + 1 - way.low] = True
