@@ -217,7 +217,8 @@ def compare(n, motion, recall, energy):
         for config in (moving, dense)
     )
     ring = rings(moving, np.dtype(float))
-    assert np.abs(ring_difference(pose - whole_pose, ring)).max() <= 1e-12
+    # Rounding errors add up, cells: 1.4e-12 were found in 1,000 steps.
+    assert np.abs(ring_difference(pose - whole_pose, ring)).max() <= 1e-14 * max(len(motion), 100)
     assert np.nanmax(np.abs(spread - whole_spread)) <= 1e-9
     assert np.array_equal(outcome, whole_outcome)
     assert not np.any(whole_level)
