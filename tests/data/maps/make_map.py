@@ -13,14 +13,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from ratslam.runs.checkpoint_file import FORMAT
-from robot.sources.description import describe
 
 import ratslam
+from ratslam.methods.map_file import FORMAT
 from ratslam.runs.settings.run_config import LoopConfig
 from ratslam.runs.settings.strict_yaml import parse, validate
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
+from robot.sources.source import describe
 
 FOLDER = Path(__file__).parent
 RECORDING = FOLDER.parents[1] / "golden" / "touch_circuits.mcap"
