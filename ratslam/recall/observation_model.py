@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from ratslam.recall.config import RecallConfig, sector_shifts
 from ratslam.recall.memory import Memory
@@ -164,17 +165,23 @@ def _errors(shifts: np.ndarray, memory: Memory, view: Array) -> Array:
     """[S, C] mean absolute difference between view[k:] and the stored views' [:-k] for each shift k; infinite
     for shifts that are not allowed because the sectors are not known to be ordered."""
     size = memory.view.shape[0]
-    rows = []
-    for k in shifts.tolist():
-        stored = memory.view[max(-k, 0) : size - max(k, 0)]
-        seen = view[max(k, 0) : size - max(-k, 0)]
-        if size <= abs(k):
-            rows.append(jnp.full(memory.view.shape[1], jnp.inf, memory.view.dtype))
-            continue
-        # An explicit sum makes one pass over the keyframes; a reduction takes twice as long.
-        apart = sum((jnp.abs(stored[i] - seen[i]) for i in range(len(stored))), jnp.zeros_like(stored[0]))
-        rows.append(apart / len(stored))
-    return jnp.where(memory.allowed_shifts(shifts)[:, None], jnp.stack(rows), jnp.inf)
+    common = np.maximum(size - np.abs(shifts), 0)  # [S] rows that both have
+    reach = int(np.max(np.abs(shifts)))
+    padded = jnp.pad(view, reach)
+
+    # One row after the other: a reduction over all rows at once takes several times as long.
+    def add_row(total: Array, one: tuple[Array, Array]) -> tuple[Array, None]:
+        row, stored = one
+        seen = lax.dynamic_slice_in_dim(padded, row, 2 * reach + 1)[shifts + reach]
+        both = (row + shifts >= 0) & (row + shifts < size)
+        return total + jnp.where(both[:, None], jnp.abs(stored[None] - seen[:, None]), 0.0), None
+
+    rows = jnp.arange(size, dtype=jnp.int32)
+    total, _ = lax.scan(
+        add_row, jnp.zeros((len(shifts), memory.view.shape[1]), view.dtype), (rows, memory.view)
+    )
+    mean = total / jnp.asarray(np.maximum(common, 1), view.dtype)[:, None]
+    return jnp.where((memory.allowed_shifts(shifts) & (common > 0))[:, None], mean, jnp.inf)
 
 
 def _background(error: Array, away: Array) -> Array:
