@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter, deque
+from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +25,6 @@ from tactile.base.types import Cycle, Odometry
 LATE = 4096
 """Largest distance of a late frame behind the newest; a head buffers no more frames."""
 HALF = WRAP // 2
-UNWRAPPED_AT_ONCE = 1024
-"""Numbers processed at once."""
 
 
 class SequenceUnwrapper:
@@ -42,7 +41,7 @@ class SequenceUnwrapper:
         self._begun = False
         self._first = self._highest = self._held = 0
         self._before = 0
-        self._seen = np.zeros(LATE, bool)
+        self._seen = bytearray(LATE)
 
     @property
     def missing(self) -> int:
@@ -61,38 +60,22 @@ class SequenceUnwrapper:
             [N] int64 unwrapped numbers, and [N] bool, those to accept: new, and not before the first of the
             stream.
         """
-        raw = raw.astype(np.int64)
-        number, new = np.empty_like(raw), np.ones(len(raw), bool)
-        place = 0
-        while place < len(raw):
-            some = slice(place, place + self._rising(raw[place : place + UNWRAPPED_AT_ONCE]))
-            if some.stop > place:
-                number[some] = self._highest + (raw[some] - self._highest) % WRAP
-                # Increasing numbers, all above the highest, are accepted.
-                last = int(number[some.stop - 1])
-                self._seen[np.arange(max(self._highest, last - LATE) + 1, last + 1) % LATE] = False
-                recent = number[some]
-                self._seen[recent[recent > last - LATE] % LATE] = True
-                self._highest = last
-                self._held += len(recent)
-                place = some.stop
-            else:
-                number[place], new[place] = self._other(int(raw[place]))
-                place += 1
+        number, new = np.empty(len(raw), np.int64), np.empty(len(raw), bool)
+        for place, each in enumerate(raw.tolist()):
+            number[place], new[place] = self._take_one(each)
         return number, new
 
-    def _rising(self, raw: np.ndarray) -> int:
-        """Length of the leading part of numbers [N] in which each is ahead of the previous one."""
-        if not self._begun:
-            return 0
+    def _take_one(self, raw: int) -> tuple[int, bool]:
+        """Unwraps a number; returns it and whether to accept it."""
         ahead = (raw - self._highest) % WRAP
-        rising = ahead < HALF
-        rising[0] &= ahead[0] > 0
-        rising[1:] &= ahead[1:] > ahead[:-1]
-        return len(raw) if rising.all() else int(rising.argmin())
-
-    def _other(self, raw: int) -> tuple[int, bool]:
-        """Unwraps a number that is not ahead; returns it and whether to accept it."""
+        if self._begun and 0 < ahead < HALF:
+            number = self._highest + ahead
+            for skipped in range(max(self._highest, number - LATE) + 1, number):
+                self._seen[skipped % LATE] = False
+            self._seen[number % LATE] = True
+            self._highest = number
+            self._held += 1
+            return number, True
         number = self._highest - (self._highest - raw) % WRAP
         if not self._begun or number <= self._highest - LATE:
             self.restart()
@@ -105,14 +88,10 @@ class SequenceUnwrapper:
         new = number > self._first and not self._seen[number % LATE]
         self._seen[number % LATE] |= new
         self._held += new
-        return number, bool(new)
+        return number, new
 
     def _lacking(self) -> int:
         return self._highest - self._first + 1 - self._held if self._begun else 0
-
-
-BATCH, MAX_BATCH = 32, 1024
-"""Frames checked at once: the first number after a fault, doubled after every batch without one."""
 
 
 class Frames(NamedTuple):
@@ -130,10 +109,10 @@ class Frames(NamedTuple):
     values: np.ndarray
 
     @classmethod
-    def blank(cls, whiskers: int, rows: int = 0) -> Frames:
-        """Frames of zeros, by default none, of a head with this number of whiskers."""
-        number, flags = np.zeros(rows, np.int64), np.zeros(rows, np.uint8)
-        return cls(number, number.copy(), flags, np.zeros((rows, whiskers, CHANNELS), np.int16))
+    def blank(cls, whiskers: int) -> Frames:
+        """No frames of a head with this number of whiskers."""
+        nothing = np.zeros(0, np.int64)
+        return cls(nothing, nothing, np.zeros(0, np.uint8), np.zeros((0, whiskers, CHANNELS), np.int16))
 
     def select(self, first: int, last: int) -> Frames:
         """The frames from first to last, both included, ordered by sequence number."""
@@ -168,20 +147,14 @@ class DecoderCounts(NamedTuple):
 
 class Decoder:
     """Decodes the frames of `robot.drivers.head.usb_protocol`. A decoder of another stream needs the members
-    `counts`, `feed` and `restart`.
-
-    Args:
-        whiskers: number on the head. channels: per whisker.
-    """
+    `counts`, `feed` and `restart`."""
 
     def __init__(self, whiskers: int, channels: int = CHANNELS) -> None:
         self._type = frame_dtype(whiskers, channels)
         self._size = self._type.itemsize
         self._shape = bytes((whiskers, channels, VERSION))
         self._shape_at = self._type.fields["whiskers"][1]  # type: ignore[index]
-        self._magic = int.from_bytes(MAGIC, "little")
         self._rest = b""
-        self._run = BATCH
         self._numbering = SequenceUnwrapper()
         self._time: int | None = None
         self._counts = Counter[str]()
@@ -211,43 +184,25 @@ class Decoder:
     def feed(self, data: bytes) -> Frames:
         """The samples completed by these bytes."""
         buffer = self._rest + data if self._rest else bytes(data)
-        runs: list[bytes] = []
+        frames: list[bytes] = []
         place = 0
         while 0 <= (start := buffer.find(MAGIC, place)) <= len(buffer) - self._size:
             self._counts["skipped_bytes"] += start - place
-            place = start + self._count_valid(buffer, start) * self._size
-            if place > start:
-                runs.append(buffer[start:place])
+            frame = buffer[start : start + self._size]
+            shape, crc = frame[self._shape_at : self._shape_at + 3], int.from_bytes(frame[-4:], "little")
+            if shape == self._shape and zlib.crc32(frame[:-4]) == crc:
+                frames.append(frame)
+                place = start + self._size
             else:
                 self._counts.update(("bad", "skipped_bytes"))
-                place += 1
+                place = start + 1
         end = start
         if end < 0:  # the last bytes may be the start of the magic
             tail = buffer[max(place, len(buffer) - 3) :]
             end = len(buffer) - next((k for k in range(len(tail), 0, -1) if tail.endswith(MAGIC[:k])), 0)
         self._counts["skipped_bytes"] += end - place
         self._rest = buffer[end:]
-        return self._accept(np.frombuffer(b"".join(runs), self._type))
-
-    def _count_valid(self, buffer: bytes, start: int) -> int:
-        """Number of consecutive valid frames from `start` in the batch checked at once."""
-        shape_at = start + self._shape_at
-        if buffer[shape_at : shape_at + 3] != self._shape:
-            return 0
-        count = min((len(buffer) - start) // self._size, self._run)
-        frames = np.frombuffer(buffer, self._type, count, start)
-        whiskers, channels, version = self._shape
-        fits = (frames["magic"] == self._magic) & (frames["version"] == version)
-        fits &= (frames["whiskers"] == whiskers) & (frames["channels"] == channels)
-        body, raw = self._size - 4, memoryview(buffer)
-        whole = 0
-        for crc in frames["crc"][: count if fits.all() else int(fits.argmin())].tolist():
-            place = start + whole * self._size
-            if zlib.crc32(raw[place : place + body]) != crc:
-                break
-            whole += 1
-        self._run = min(2 * self._run, MAX_BATCH) if whole == count else BATCH
-        return whole
+        return self._accept(np.frombuffer(b"".join(frames), self._type))
 
     def _accept(self, frames: np.ndarray) -> Frames:
         number, new = self._numbering.take(frames["sequence"])
@@ -321,26 +276,39 @@ def assemble_cycle(frames: Frames, cut: Cut) -> Cycle:
 
 
 class FrameWindow:
-    """The most recent frames of a head with this number of whiskers, in blocks as they arrived."""
+    """The most recent frames of a head with this number of whiskers, in blocks as they arrived.
+
+    Any thread may read while another adds; results are copies.
+
+    Attributes:
+        newest: highest number, its device time (us) and the last arrival (host time, s); None without frames.
+    """
 
     def __init__(self, whiskers: int) -> None:
+        self.newest: tuple[int, int, float] | None = None
         self._empty = Frames.blank(whiskers)
-        self._blocks: deque[Frames] = deque()
+        self._blocks: deque[tuple[int, int, Frames]] = deque()  # lowest and highest number, and the block
         self._count = 0
+        self._lock = Lock()
 
-    def add(self, block: Frames) -> None:
-        """Adds a block; drops the oldest ones beyond the last `MAX_FRAMES` frames."""
+    def add(self, block: Frames, arrival: float = np.nan) -> None:
+        """Adds a block that arrived at a host time, s; drops the oldest ones beyond the last `MAX_FRAMES`
+        frames."""
         if not len(block.sequence):
             return
-        self._blocks.append(block)
-        self._count += len(block.sequence)
-        while self._count - len(self._blocks[0].sequence) >= MAX_FRAMES:
-            self._count -= len(self._blocks.popleft().sequence)
+        place = int(block.sequence.argmax())
+        low, high, time = int(block.sequence.min()), int(block.sequence[place]), int(block.time[place])
+        with self._lock:
+            before = self.newest or (high, time, arrival)
+            self.newest = (*max((high, time), before[:2]), arrival)
+            self._blocks.append((low, high, block))
+            self._count += len(block.sequence)
+            while self._count - len(self._blocks[0][2].sequence) >= MAX_FRAMES:
+                self._count -= len(self._blocks.popleft()[2].sequence)
 
     def between(self, first: int, last: int) -> Frames:
         """The present frames from first to last, both included, ordered by sequence number."""
-        blocks = [
-            block for block in self._blocks if block.sequence.min() <= last and block.sequence.max() >= first
-        ]
+        with self._lock:
+            blocks = [block for low, high, block in self._blocks if low <= last and high >= first]
         parts = zip(*(blocks or [self._empty]), strict=True)
         return Frames(*(np.concatenate(part) for part in parts)).select(first, last)

@@ -106,30 +106,18 @@ class Bridge:
         util.claim_interface(device, wire.INTERFACE)
 
     def read(self, size: int, timeout: float) -> bytes:
-        """Reads at most `size` bytes of the stream; none if none arrive within `timeout` s.
-
-        Raises:
-            Disconnected, Stalled.
-        """
+        """Reads at most `size` bytes of the stream; none if none arrive within `timeout` s."""
         patience = max(1, round(1000 * timeout))
         got = self._try(lambda: self._device.read(wire.ENDPOINT_IN, size, patience), wire.ENDPOINT_IN)
         return b"" if got is None else got.tobytes()
 
     def write(self, data: bytes) -> None:
-        """Sends a command.
-
-        Raises:
-            Disconnected, Stalled.
-        """
+        """Sends a command."""
         if self._try(lambda: self._device.write(wire.ENDPOINT_OUT, data, TIMEOUT), wire.ENDPOINT_OUT) is None:
             raise Stalled(errno.ETIMEDOUT, "commands are not accepted")
 
     def request(self, request: Request) -> bytes:
-        """Sends a control request and returns the answer; `Stalled` if it is unknown or not answered.
-
-        Raises:
-            Disconnected, Stalled: unknown request, or no answer.
-        """
+        """Sends a control request and returns the answer; `Stalled` if it is unknown or not answered."""
         kind = wire.REQUEST_IN
         content: int | bytes = 8 if request == Request.CLOCK else wire.MAX_ANSWER  # size of the answer
         if request in (Request.START, Request.STOP):

@@ -58,11 +58,7 @@ class Address(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Parses an address.
-
-        Raises:
-            ValueError: invalid address.
-        """
+        """Parses an address."""
         if found := _USB.fullmatch(text):
             vendor, product, serial = found.groups()
             return cls(int(vendor, 16), int(product, 16), serial) if vendor else cls()

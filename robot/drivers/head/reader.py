@@ -14,7 +14,7 @@ from enum import Enum
 
 import numpy as np
 
-from robot.drivers.head.decoder import Decoder, Frames
+from robot.drivers.head.decoder import Decoder, Frames, FrameWindow
 from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled
 from robot.drivers.head.driver_config import HeadLinkConfig
 from robot.drivers.head.usb_protocol import ANGLE, CHANNELS, KEEP_ALIVE, Command, CommandKind, Request
@@ -76,7 +76,7 @@ class HeadReader:
     ) -> None:
         self.config = config
         self.decoder = Decoder(whiskers) if decoder is None else decoder
-        self.ring = RingBuffer(whiskers)
+        self.ring = FrameWindow(whiskers)
         self.listeners: list[Callable[[Frames, float], None]] = []
         self.on_restart: list[Callable[[int, float], None]] = []
         self.identity: HeadIdentity | None = None
@@ -218,7 +218,7 @@ class HeadReader:
         if not len(frames.sequence):
             return
         self._sample = now
-        self.ring.append(frames, now)
+        self.ring.add(frames, now)
         whisker = self._overload.check(frames.values)
         if whisker is not None:
             self._on_overload(whisker)
@@ -314,51 +314,3 @@ class OverloadDetector:
         twice = beyond & np.concatenate([self._before[None], beyond[:-1]])
         self._before = beyond[-1]
         return int(np.flatnonzero(twice.any(axis=0))[0]) if twice.any() else None
-
-
-SIZE = 2**16
-"""Number of samples: 33 s at 2 kHz."""
-EMPTY = -(2**62)
-
-
-class RingBuffer:
-    """The last samples. Any thread may read while another appends; results are copies.
-
-    Args:
-        whiskers: of the head. size: number of samples, a power of two.
-    """
-
-    def __init__(self, whiskers: int, size: int = SIZE) -> None:
-        if size & (size - 1):
-            raise ValueError(f"size {size}: must be a power of two")
-        self._size = size
-        self._frames = Frames.blank(whiskers, size)
-        self._frames.sequence[:] = EMPTY
-        self._newest, self._latest, self._arrival = EMPTY, EMPTY, -np.inf
-        self._lock = threading.Lock()
-
-    @property
-    def newest(self) -> tuple[int, int, float] | None:
-        """Highest number, its device time (us) and the last arrival (host time, s); None without samples."""
-        with self._lock:
-            return None if self._newest == EMPTY else (self._newest, self._latest, self._arrival)
-
-    def append(self, frames: Frames, arrival: float) -> None:
-        """Adds frames that arrived at a host time, s; frames older than the ring are ignored."""
-        with self._lock:
-            if not len(frames.sequence):
-                return
-            newest = max(self._newest, int(frames.sequence.max()))
-            fresh = frames.sequence > newest - self._size
-            place = frames.sequence[fresh] % self._size
-            for column, added in zip(self._frames, frames, strict=True):
-                column[place] = added[fresh]
-            self._newest, self._arrival = newest, arrival
-            self._latest = int(self._frames.time[newest % self._size])
-
-    def between(self, first: int, last: int) -> Frames:
-        """The present frames from `first` to `last`, both included, ordered by sequence number."""
-        with self._lock:
-            number = np.arange(max(first, self._newest - self._size + 1), min(last, self._newest) + 1)
-            place = number[self._frames.sequence[number % self._size] == number] % self._size
-            return Frames(*(column[place] for column in self._frames))

@@ -29,9 +29,6 @@ def whisk_commands(
     Args:
         threshold: [W] contact thresholds of y, rad from the centre, infinite for whiskers without feedback;
             None: no feedback. centre: [W] mean of y in free air, rad. rcp: where feedback is computed.
-
-    Raises:
-        InputError: the head does not support the mode.
     """
     if whisking.mode == "spread" and rcp == "head":
         raise InputError(f"{WHERE}.mode", "spread", "rcp or open", "or set `live.head.rcp: host`")
@@ -95,11 +92,7 @@ class HostRcp:
 
 
 class HeadDriver:
-    """Controls the whisking of a head.
-
-    Args:
-        reader: of the head; its settings select the place of feedback. head: its geometry.
-    """
+    """Controls the whisking of a head."""
 
     def __init__(self, reader: HeadReader, head: Head) -> None:
         self._reader, self._head = reader, head

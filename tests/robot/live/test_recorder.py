@@ -181,7 +181,7 @@ def test_a_cut_must_match_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert scanner.broken == "a whisk of 21 frames, of which 20 are present"
 
 
-def test_the_frame_window_agrees_with_the_ring_buffer() -> None:
+def test_the_frame_window_drops_the_oldest_frames() -> None:
     window = FrameWindow(W)
     assert len(window.between(0, 10**9).sequence) == 0
     block = some_frames(1000)

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.drivers.head import usb_protocol as wire
-from robot.drivers.head.decoder import Frames
+from robot.drivers.head.decoder import Frames, FrameWindow
 from robot.drivers.head.driver_config import HeadLinkConfig
-from robot.drivers.head.reader import HeadReader, LinkState, OverloadDetector, RingBuffer
+from robot.drivers.head.reader import HeadReader, LinkState, OverloadDetector
 from robot.drivers.head.usb_protocol import ANGLE, Command, CommandKind, FeedbackMode, Request, to_counts
 from robot.drivers.head.whisk_control import HeadDriver, HostRcp, whisk_commands
 from robot.drivers.outcome import SessionOutcome
@@ -26,8 +26,8 @@ PATIENT = HeadLinkConfig(silence=30.0, patience=60.0)
 """Limits for tests that lose no data on a busy machine."""
 DRIVE = Command(CommandKind.DRIVE, FeedbackMode.RCP, 1.0, 1.0)
 CENTRE = Command(CommandKind.CENTRE, numbers=np.array([3, 4], np.int16))
-SIZE, LIMIT = 16, 1000
-"""Of the ring buffer, and of the deflection, in counts."""
+LIMIT = 1000
+"""Of the deflection, in counts."""
 
 
 def amplitudes(number):
@@ -245,30 +245,21 @@ BLOCKS = st.lists(st.lists(st.integers(-40, 40), max_size=8, unique=True), max_s
 
 
 @given(BLOCKS, st.integers(0, 60), st.integers(0, 40))
-def test_the_ring_holds_copies_of_the_newest_frames(blocks, first, length):
+def test_the_window_holds_the_newest_frames(blocks, first, length):
     """A block holds steps about the highest number so far."""
-    ring, stored, highest = RingBuffer(1, size=SIZE), {}, 2**32
-    assert ring.newest is None
+    window, stored, highest = FrameWindow(1), [], 2**32
+    assert window.newest is None
     for k, block in enumerate(blocks):
-        numbers = [highest + step for step in block]
-        highest = max([highest, *numbers]) if stored or numbers else highest
-        ring.append(frames(numbers), float(k))
-        stored |= {n: 500 * n for n in numbers}
+        numbers = [number for step in block if (number := highest + step) not in stored]
+        window.add(frames(numbers), float(k))
+        stored += numbers
+        highest = max(stored, default=highest)
         if stored:
-            newest = max(stored)
-            stored = {n: t for n, t in stored.items() if n > newest - SIZE}
-            assert ring.newest[:2] == (newest, 500 * newest)
+            assert window.newest[:2] == (highest, 500 * highest)
     start = 2**32 - 20 + first
-    wanted = sorted(n for n in stored if start <= n <= start + length)
-    got = ring.between(start, start + length)
-    ring.append(frames(list(range(2**33, 2**33 + SIZE))), 0.0)
-    for column, expected in zip(got, frames(wanted), strict=True):
+    wanted = sorted(number for number in stored if start <= number <= start + length)
+    for column, expected in zip(window.between(start, start + length), frames(wanted), strict=True):
         np.testing.assert_array_equal(column, expected)
-
-
-def test_the_size_of_a_ring_must_be_a_power_of_two():
-    with pytest.raises(ValueError, match="power of two"):
-        RingBuffer(1, size=100)
 
 
 HEAD = ur10_head(HeadConfig())
