@@ -7,12 +7,14 @@ A fault request is an object {"do": name, ...} with the arguments of the fault.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import errno
 import ipaddress
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from contextlib import ExitStack, asynccontextmanager, suppress
+from functools import partial
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
@@ -23,11 +25,15 @@ from tactile.base.settings import Settings
 Model = TypeVar("Model", bound=Settings)
 
 OPENS = "anyone who reaches this address may command, fault or stop the emulator"
+Client = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+"""Serves one client of a port."""
 
 
-@contextmanager
-def listening(host: str, port: int, open_to_network: bool) -> Iterator[None]:
-    """A context that opens a port.
+@asynccontextmanager
+async def open_ports(
+    host: str, open_to_network: bool, clients: Iterable[tuple[Client, int]]
+) -> AsyncIterator[None]:
+    """A context that serves ports.
 
     Raises:
         InputError: the address is not loopback and the network was not asked for, or it cannot be used.
@@ -36,14 +42,26 @@ def listening(host: str, port: int, open_to_network: bool) -> Iterator[None]:
         cure = f"or `--open-to-network` (open_to_network: true): {OPENS}"
         found, expected = "an address that others may reach", "loopback, such as 127.0.0.11"
         raise InputError(repr(host), found, expected, cure)
-    try:
+    with ExitStack() as stack:
+        for client, port in clients:
+            where, cure = f"{host}:{port}", "choose an address of this machine with --host"
+            try:
+                opened = await asyncio.start_server(partial(_talk, client), host, port)
+            except OSError as error:
+                if error.errno == errno.EADDRINUSE:
+                    found = "something listens there already, such as another emulator"
+                    raise InputError(where, found, "a free address", f"use it, stop it, or {cure}") from None
+                found = f"cannot listen ({error.strerror})"
+                raise InputError(where, found, "a free address", cure) from None
+            stack.callback(opened.close)  # without waiting for clients that stay connected
         yield
-    except OSError as error:
-        where, cure = f"{host}:{port}", "choose an address of this machine with --host"
-        if error.errno == errno.EADDRINUSE:
-            found = "something listens there already, such as another emulator"
-            raise InputError(where, found, "a free address", f"use it, stop it, or {cure}") from None
-        raise InputError(where, f"cannot listen ({error.strerror})", "a free address", cure) from None
+
+
+async def _talk(client: Client, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Serves a client; a disconnection is no error."""
+    with suppress(OSError, asyncio.IncompleteReadError, asyncio.CancelledError):
+        await client(reader, writer)
+    writer.close()
 
 
 def is_loopback(host: str) -> bool:

@@ -123,11 +123,7 @@ TICK = 0.005
 
 
 class _CreateServer:
-    """An emulated Create in real time; `start` begins to serve its serial line.
-
-    Attributes:
-        robot: the robot. began: its time 0 on the host's monotonic clock, s.
-    """
+    """An emulated Create in real time; `start` begins to serve its serial line."""
 
     def __init__(self, config: CreateEmulatorConfig) -> None:
         world = config.world

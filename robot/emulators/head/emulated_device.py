@@ -243,11 +243,7 @@ class _HeadFaults:
         """Faults by name; each takes its arguments."""
 
     def check_in(self, now: float) -> bool:
-        """Whether the frame endpoint returns data.
-
-        Raises:
-            OSError: EPIPE while the endpoint is halted.
-        """
+        """Whether the frame endpoint returns data."""
         if self._halted or now < self._halted_until:
             self._halted = True
             raise usb_error(errno.EPIPE)

@@ -10,8 +10,7 @@ import asyncio
 import contextlib
 import errno
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
-from functools import partial
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 from robot.drivers.head.emulated_cable import ANSWER, IN, REQUEST, Op, usb_error
@@ -21,14 +20,11 @@ from robot.drivers.ur10.rtde_protocol import PoseListener
 from robot.emulators.head.emulated_device import DESCRIPTORS, EmulatedHead
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.head.whiskers import AlongPath, CarriedByArm, PoseSource, Whiskers
-from robot.emulators.listening import answer_fault, listening
+from robot.emulators.listening import answer_fault, open_ports
 from robot.world.scene import HeadPath, KidnapConfig, make_scene
 from tactile.whisker_geometry import ur10_head
 
-Client = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 FaultHandler = Callable[[dict[str, Any], float], dict[str, Any]]
-ENDS = (ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError)
-"""Exceptions that end a connection."""
 
 
 def serve(config: HeadEmulatorConfig) -> None:
@@ -67,25 +63,11 @@ async def open_server(
 
     Args:
         do: executes a fault request at a time, s, and returns the answer.
-
-    Raises:
-        InputError: the address cannot be used.
     """
     server = _HeadServer(bridge, do)
-    async with contextlib.AsyncExitStack() as stack:
-        for client, port in ((server.usb, config.port), (server.faults, config.control_port)):
-            talk = partial(_talk, client)
-            with listening(config.host, port, config.open_to_network):
-                opened = await asyncio.start_server(talk, config.host, port, reuse_address=True)
-            await stack.enter_async_context(opened)
+    ports = ((server.usb, config.port), (server.faults, config.control_port))
+    async with open_ports(config.host, config.open_to_network, ports):
         yield server
-
-
-async def _talk(client: Client, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Serves a client; a disconnection is no error."""
-    with contextlib.suppress(*ENDS):
-        await client(reader, writer)
-    writer.close()
 
 
 class _HeadServer:

@@ -245,9 +245,6 @@ class _ServoDrives:
     def begin(self, time: float, balance: WhiskerBalance) -> WhiskerBalance:
         """Selects the next activity; called at the start of each block and after `samples_left` samples.
 
-        Args:
-            time: s. balance: state of the whiskers.
-
         Returns:
             state of the whiskers: at rest at the beginning of a cycle.
         """

@@ -317,9 +317,6 @@ class _ControlProgram:
     controller: the function of ur_rtde returns False or raises an error, and the emulator names it on
     standard error. Functions that do not wait for an answer (`servoJ`, `speedL`, ...) return True the first
     time, but end the program too.
-
-    Args:
-        controller: executes the commands. text: the uploaded program.
     """
 
     def __init__(self, controller: EmulatedController, text: str) -> None:

@@ -230,11 +230,7 @@ class EmulatedArm:
         self._update_force()
 
     def _start(self, order: MoveOrder) -> _LinearMotion | StopL | None:
-        """The motion that executes an order; None if the tool is at the goal already.
-
-        Raises:
-            Unreachable: no joint solution for the goal.
-        """
+        """The motion that executes an order; None if the tool is at the goal already."""
         state, ratio, acceleration = self.state, self.turn_ratio, max(order.acceleration, SMALL)
         if isinstance(order, StopL):
             return StopL(acceleration)

@@ -1,4 +1,4 @@
-"""Main loop of the emulator, control steps at absolute times with client data in between, sessions, faults.
+"""Control steps of the emulator at absolute times with client data in between, sessions, faults.
 
 One thread, no locks. Late steps are made up for, up to `BACKLOG`, so that the mean rate holds on a busy
 machine; steps later than that are skipped, and the robot's clock jumps. Sources of the sessions: Universal
@@ -7,20 +7,20 @@ Robots, "Real-Time Data Exchange (RTDE) Guide" and "Dashboard Server", CB3 and e
 
 from __future__ import annotations
 
-import contextlib
+import asyncio
 import math
 import os
 import selectors
-import socket
 import struct
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from robot.drivers.processes import urgent
 from robot.drivers.ur10 import dashboard, rtde_protocol
 from robot.drivers.ur10.rtde_protocol import RTDE_PORT
-from robot.emulators.listening import answer_fault, do_fault, listening
+from robot.emulators.listening import answer_fault, do_fault, open_ports
 from robot.emulators.ur10.controller import EmulatedController, RobotMode, Runtime, Value
 from robot.emulators.ur10.emulated_arm import Unreachable
 from robot.emulators.ur10.emulator_config import FAULT_PORT, SCRIPT_PORT, UrEmulatorConfig, WallConfig
@@ -31,123 +31,90 @@ BACKLOG = 0.1  # s
 PENDING = 1 << 18  # unread bytes of a client above which it gets no states
 
 
-class _Connection:
-    """A socket with its session and its unsent bytes."""
-
-    def __init__(self, link: socket.socket, session: RtdeSession | _LineSession) -> None:
-        link.setblocking(False)
-        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.link = link
-        self.session = session
-        self._pending = b""
-
-    def send(self, data: bytes) -> None:
-        """Sends now or later; drops them if the client does not read. Raises OSError if disconnected."""
-        if self._pending:
-            if len(self._pending) > PENDING:
-                return
-            data = self._pending + data
-        try:
-            self._pending = data[self.link.send(data) :]
-        except BlockingIOError:
-            self._pending = data
-
-
 class _ControllerServer:
-    """Four listening ports around one controller."""
+    """Four listening ports around one controller.
+
+    Attributes:
+        rtde: the sessions of RTDE clients, with their connections.
+    """
 
     def __init__(self, config: UrEmulatorConfig) -> None:
         self.controller = EmulatedController(config)
         self.claims = Claims()
         self.faults = _ControllerFaults(self)
-        self.clients: list[_Connection] = []
-        self._selector = selectors.SelectSelector()  # resolution 1 us; epoll has 1 ms
-        self._steps = 0
-        ports: dict[int, Callable[[], RtdeSession | _LineSession]] = {
+        self.rtde: dict[RtdeSession, asyncio.StreamWriter] = {}
+
+    async def run(self) -> None:
+        """Listens, prints "ready" and runs until the process is ended."""
+        sessions: dict[int, Callable[[], RtdeSession | _LineSession]] = {
             RTDE_PORT: lambda: RtdeSession(self.controller, self.claims),
             SCRIPT_PORT: lambda: ScriptSession(self.controller),
             dashboard.PORT: lambda: DashboardSession(self.controller),
             FAULT_PORT: lambda: _LineSession(self.faults.answer),
         }
-        for port, make_session in ports.items():
-            with listening(config.host, port, config.open_to_network):
-                listener = socket.create_server((config.host, port), backlog=16)
-            listener.setblocking(False)
-            self._selector.register(listener, selectors.EVENT_READ, make_session)
+        config = self.controller.config
+        ports = [(partial(self._talk, make_session), port) for port, make_session in sessions.items()]
+        async with open_ports(config.host, config.open_to_network, ports):
+            print("ready", flush=True)
+            await self._keep_time()
 
-    @property
-    def rtde(self) -> list[tuple[_Connection, RtdeSession]]:
-        """RTDE clients: connections and sessions."""
-        return [(c, c.session) for c in self.clients if isinstance(c.session, RtdeSession)]
-
-    def run(self) -> None:
-        """Runs until the process is ended."""
-        dt = self.controller.dt
+    async def _keep_time(self) -> None:
+        dt, steps = self.controller.dt, 0
         due = time.monotonic() + dt
         while True:
-            for key, _ in self._selector.select(max(0.0, due - time.monotonic())):
-                self._serve(key)
+            await asyncio.sleep(max(0.0, due - time.monotonic()))
             now = time.monotonic()
             if now - due > BACKLOG:
                 missed = int((now - due) / dt)
                 self.controller.time += missed * dt
                 due += missed * dt
             while due <= now:
-                self._step(now)
-                due += dt
+                due, steps = due + dt, steps + 1
+                self._step(now, steps)
 
-    def close(self, connection: _Connection) -> None:
-        """Closes a client's connection, if open."""
-        if connection in self.clients:
-            self.clients.remove(connection)
-            self._selector.unregister(connection.link)
-            connection.link.close()
-            connection.session.close()
-
-    def _step(self, now: float) -> None:
+    def _step(self, now: float, number: int) -> None:
         self.controller.tick(now)
-        self._steps += 1
-        if not self.faults.sends_states(self._steps):
+        if not self.faults.sends_states(number):
             return
         overrides = self.faults.overrides()
-        for connection, session in self.rtde:
-            if session.started and self._steps % session.every == 0:
-                self.send(connection, session.state(overrides))
+        for session, connection in self.rtde.items():
+            if session.started and number % session.every == 0:
+                send(connection, session.state(overrides))
 
-    def _serve(self, key: selectors.SelectorKey) -> None:
-        if not isinstance(key.data, _Connection):
-            assert isinstance(key.fileobj, socket.socket)
-            with contextlib.suppress(OSError):
-                joined = _Connection(key.fileobj.accept()[0], key.data())
-                self.clients.append(joined)
-                self._selector.register(joined.link, selectors.EVENT_READ, joined)
-                if isinstance(joined.session, DashboardSession):
-                    self.send(joined, WELCOME)
-            return
-        connection = key.data
-        if connection not in self.clients:
-            return
-        if self.faults.stalled and isinstance(connection.session, RtdeSession):
-            time.sleep(0.0005)  # the data stay unread, so `select` returns at once
-            return
+    async def _talk(
+        self,
+        make_session: Callable[[], RtdeSession | _LineSession],
+        reader: asyncio.StreamReader,
+        connection: asyncio.StreamWriter,
+    ) -> None:
+        session = make_session()
+        if isinstance(session, RtdeSession):
+            self.rtde[session] = connection
+        elif isinstance(session, DashboardSession):
+            send(connection, WELCOME)
         try:
-            data = connection.link.recv(1 << 16)
-            reply = connection.session.receive(data, time.monotonic()) if data else b""
-        except BlockingIOError:
+            while data := await reader.read(1 << 16):
+                while session in self.rtde and self.faults.stalled:
+                    await asyncio.sleep(0.001)
+                if connection.is_closing():
+                    return
+                send(connection, session.receive(data, time.monotonic()))
+        except ValueError:  # not of its protocol
             return
-        except (OSError, ValueError):
-            data = reply = b""
-        if not data:
-            self.close(connection)
-        elif reply:
-            self.send(connection, reply)
+        finally:
+            self.close(session)
 
-    def send(self, connection: _Connection, data: bytes) -> None:
-        """Sends to a client; closes the connection if that fails."""
-        try:
-            connection.send(data)
-        except OSError:
-            self.close(connection)
+    def close(self, session: RtdeSession | _LineSession) -> None:
+        """Ends a session; closes the connection of an RTDE client at once."""
+        session.close()
+        if isinstance(session, RtdeSession) and session in self.rtde:
+            self.rtde.pop(session).transport.abort()
+
+
+def send(connection: asyncio.StreamWriter, data: bytes) -> None:
+    """Sends to a client now or later; drops the data if the client has gone or does not read."""
+    if not connection.is_closing() and connection.transport.get_write_buffer_size() <= PENDING:
+        connection.write(data)
 
 
 def serve(config: UrEmulatorConfig) -> None:
@@ -160,17 +127,14 @@ def serve(config: UrEmulatorConfig) -> None:
         server = _ControllerServer(config)
     except Unreachable as error:
         raise InputError("start", str(error), "a pose within 1.3 m of the base", "move it") from error
-    with urgent():
-        print("ready", flush=True)
-        server.run()
+
+    precise = partial(asyncio.SelectorEventLoop, selectors.SelectSelector())  # 1 us; epoll has 1 ms
+    with urgent(), asyncio.Runner(loop_factory=precise) as runner:
+        runner.run(server.run())
 
 
 class _LineSession:
-    """One client of a port whose requests are lines.
-
-    Args:
-        answer: executes a line; returns the bytes to send.
-    """
+    """One client of a port whose requests are lines."""
 
     def __init__(self, answer: Callable[[bytes], bytes]) -> None:
         self._answer, self._rest = answer, b""
@@ -248,11 +212,7 @@ class DashboardSession(_LineSession):
 
 
 class Claims:
-    """Owner of each input variable: one client at a time.
-
-    Attributes:
-        held_by_fieldbus: whether a fieldbus holds the integer registers.
-    """
+    """Owner of each input variable: one client at a time."""
 
     def __init__(self) -> None:
         self.owners: dict[str, RtdeSession] = {}
@@ -269,9 +229,6 @@ class Claims:
 
 class RtdeSession:
     """One client of RTDE.
-
-    Args:
-        controller: the emulated controller. claims: shared by all clients.
 
     Attributes:
         started: whether states are sent. every: control steps per state. ignored: number of invalid inputs.
@@ -468,18 +425,18 @@ class _ControllerFaults:
             "safety": controller.safety.name,
             "mode": controller.robot_mode.name,
             "clients": len(self._server.rtde),
-            "ignored": sum(session.ignored for _, session in self._server.rtde),
+            "ignored": sum(session.ignored for session in self._server.rtde),
         }
 
     def _send(self, damage: Callable[[bytes], bytes]) -> None:
         """Sends a damaged state to all clients of states."""
-        for connection, session in self._server.rtde:
+        for session, connection in self._server.rtde.items():
             if session.started:
-                self._server.send(connection, damage(session.state({})))
+                send(connection, damage(session.state({})))
 
     def _close_clients(self) -> None:
-        for connection, _ in self._server.rtde:
-            self._server.close(connection)
+        for session in list(self._server.rtde):
+            self._server.close(session)
 
     def _add_walls(self, **request: Any) -> None:
         arm = self._controller.arm
