@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from robot.drivers.create import protocol
 from robot.drivers.create.protocol import SensorReply
@@ -37,18 +37,6 @@ class BadReply(Exception):
     """An invalid reply."""
 
 
-class _SerialPort(Protocol):
-    """The methods of `serial.Serial` that the link uses."""
-
-    timeout: float | None
-
-    @property
-    def in_waiting(self) -> int: ...
-    def read(self, size: int = 1) -> bytes: ...
-    def write(self, data: bytes) -> int | None: ...
-    def close(self) -> None: ...
-
-
 class LinkCounts(NamedTuple):
     """Counts of queries.
 
@@ -69,8 +57,8 @@ class LinkCounts(NamedTuple):
         return self.lost - self.late
 
 
-def open_port(name: str, *, exclusive: bool = True) -> _SerialPort:
-    """Opens the serial port at the Create's speed.
+def open_port(name: str, *, exclusive: bool = True) -> Any:
+    """Opens the serial port, a `serial.Serial`, at the Create's speed.
 
     Raises:
         NoPort: the port cannot be opened; `PortBusy` if another program holds it.
@@ -83,7 +71,7 @@ def open_port(name: str, *, exclusive: bool = True) -> _SerialPort:
     # Without `exclusive` pyserial takes no lock; False is refused on Windows.
     more = {"exclusive": True} if exclusive else {}
     try:
-        port: _SerialPort = serial.Serial(name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **more)
+        return serial.Serial(name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **more)
     except OSError as error:
         # The text of pyserial's error is the only place of most causes.
         cause = error.errno or getattr(error.__context__, "errno", None)
@@ -98,7 +86,6 @@ def open_port(name: str, *, exclusive: bool = True) -> _SerialPort:
         if cause in (errno.EAGAIN, errno.EBUSY):
             raise PortBusy(name, "is held by another program", "", "end that program") from None
         raise NoPort(name, f"cannot be opened ({error})", "a serial port") from None
-    return port
 
 
 def _replies(data: bytes, elapsed: float, most: int) -> list[SensorReply]:
@@ -119,7 +106,7 @@ class SerialLink:
     the next; of a disturbed reply the end is parsed, since noise mostly precedes it.
     """
 
-    def __init__(self, port: _SerialPort) -> None:
+    def __init__(self, port: Any) -> None:
         self._port = port
         self._late_motion = (0, 0)
         self.counts = LinkCounts()
