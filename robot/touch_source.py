@@ -66,9 +66,6 @@ class TouchSource(ClosedSource):
         source: the source of readings. start: returns a new front end; called for every iteration.
         where: configuration key of the whiskers, for errors.
 
-    Attributes:
-        start: as given.
-
     Raises:
         InputError: source and front end have different numbers of whiskers.
     """
@@ -120,11 +117,7 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
 
 
 def touch_config_of(info: SourceInfo, config: TouchConfig) -> TouchConfig:
-    """The configuration with the whiskers of a source, see `head_config_of` and `report_config_of`.
-
-    Raises:
-        InputError: as `head_config_of`.
-    """
+    """The configuration with the whiskers of a source, see `head_config_of` and `report_config_of`."""
     heads = {"head": head_config_of(info, config.head), "reports": report_config_of(info, config.reports)}
     return config.model_copy(update=heads)
 
@@ -157,11 +150,7 @@ def observation_of(sample: Sample) -> Observation:
 
 def planar_whiskers_of(source: Source, config: TouchConfig) -> PlanarWhiskers | None:
     """The whiskers of a source projected to the floor; None for a source without whiskers, and for a touch
-    sensor that is not the head of the configuration.
-
-    Args:
-        config: with the whiskers of the source.
-    """
+    sensor that is not the head of the configuration."""
     if not source.whiskers:
         return None
     if source.info.planar_whiskers is not None:

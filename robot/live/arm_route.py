@@ -96,11 +96,7 @@ def whole_path(config: LiveConfig, head: Head) -> HeadPath:
 
 
 def plan_scene(plan: SimulationConfig, head: Head) -> Scene:
-    """The maze of a plan and the path in it.
-
-    Raises:
-        InputError: the plan gives no valid maze or path.
-    """
+    """The maze of a plan and the path in it."""
     return make_scene(plan.maze, plan.path, plan.motion, plan.kidnaps, head, plan.seed)
 
 

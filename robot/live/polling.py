@@ -139,9 +139,6 @@ class PolledRig:
 
         Args:
             longest: time limit, s. late: outcome after that time. what: the awaited event, for the fault.
-
-        Raises:
-            SessionFault, OperatorStop.
         """
         due = time.monotonic() + longest
         while not done():

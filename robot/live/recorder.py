@@ -28,9 +28,6 @@ class LiveRecorder(AbstractContextManager["LiveRecorder"]):
     Any thread may add data; a call waits for the disk. When the disk is full, `fault` is set, later data are
     ignored, and the recording stays readable up to that point.
 
-    Args:
-        tape: the new file.
-
     Attributes:
         fault: the error that ended writing, or None.
     """

@@ -22,9 +22,6 @@ def blank_rows(
 ) -> dict[str, Any]:
     """The arguments of an `InMemorySource` with odometry [N, 4] at times [N] s, and nothing else.
 
-    Args:
-        shape: (R, C, 1) of the views.
-
     Raises:
         InputError: these are too many pixels.
     """

@@ -43,11 +43,7 @@ class _Unclosed(EndOfFile):
 
 
 class _BoundedFile:
-    """A file whose `read` returns exactly the requested bytes or raises `EndOfFile`.
-
-    Attributes:
-        left: bytes not read yet.
-    """
+    """A file whose `read` returns exactly the requested bytes or raises `EndOfFile`."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file

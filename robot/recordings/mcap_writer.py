@@ -102,11 +102,7 @@ class Recorder(AbstractContextManager["Recorder"]):
         self.append(name, time, message)
 
     def append(self, name: str, time: float, message: bytes) -> None:
-        """Append an encoded message with that schema; the truth of a reading precedes it.
-
-        Raises:
-            RecordingWriteError: the operating system refuses to write.
-        """
+        """Append an encoded message with that schema; the truth of a reading precedes it."""
         # MCAP's clock has no negative times.
         stamp = min(max(round(time * 1e9), 0), (1 << 63) - 1) if np.isfinite(time) else 0
         if name not in self._channels:
@@ -123,11 +119,7 @@ class Recorder(AbstractContextManager["Recorder"]):
             self._flushed = time
 
     def flush(self) -> None:
-        """Hand all messages so far to the operating system.
-
-        Raises:
-            RecordingWriteError: the operating system refuses to write.
-        """
+        """Hand all messages so far to the operating system."""
         try:
             self._writer.flush()
         except OSError as error:

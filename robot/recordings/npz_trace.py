@@ -92,11 +92,7 @@ def read_trace(path: Path, judge: InputJudge = DEFAULT_JUDGE) -> InMemorySource:
 
 
 def array_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """The shapes of the arrays of a trace, by name.
-
-    Raises:
-        InputError: the file is not readable, or arrays are missing.
-    """
+    """The shapes of the arrays of a trace, by name."""
     return {name: array.shape for name, array in _arrays(path, read_bytes(path)).items()}
 
 

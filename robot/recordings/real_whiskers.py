@@ -151,9 +151,6 @@ def open_reach(config: ReachConfig) -> InMemorySource:
 
     Its odometry is the end effector's over the plane, in axes that keep their directions; its view [1, 14, 1]
     is 1 where a whisker touches. Whiskers that are bent at the end are not alive.
-
-    Raises:
-        InputError: see `read_reach`; a whisker cannot be calibrated.
     """
     record = read_reach(config.file)
     touch, count = find_touches(config, record.signal), len(record.signal)
@@ -184,11 +181,7 @@ class StageConfig(Settings):
 
 
 def read_stage(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
-    """Position [N, 3] of the stage, m, and signal [N, 3], counts, of N rows; sha256 (hex) of the file.
-
-    Raises:
-        InputError: as `read_columns`.
-    """
+    """Position [N, 3] of the stage, m, and signal [N, 3], counts, of N rows; sha256 (hex) of the file."""
     table, digest = read_columns(path, ("", "px", "py", "pz", "sx", "sy", "sz"))  # the index has no name
     return table[:, 1:4] * 1e-3, table[:, 4:], digest
 
@@ -217,11 +210,7 @@ def read_stage_calibration(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def _open_stage(config: StageConfig) -> Source:
-    """The source of a file; its motion and its true positions are the stage's x and y.
-
-    Raises:
-        InputError: as `read_stage`.
-    """
+    """The source of a file; its motion and its true positions are the stage's x and y."""
     position, signal, digest = read_stage(config.file)
     count = len(signal)
     time = np.arange(count) / config.rate_hz
@@ -273,11 +262,7 @@ def read_object(path: Path) -> tuple[np.ndarray, str]:
 
 
 def open_object(config: ObjectConfig) -> InMemorySource:
-    """The touches as a source: a signed view [1, 8, 16] a second of a robot at rest.
-
-    Raises:
-        InputError: see `read_object`.
-    """
+    """The touches as a source: a signed view [1, 8, 16] a second of a robot at rest."""
     images, digest = read_object(config.file)
     time, alive = np.arange(len(images), dtype=float), np.ones(OBJECTS_WHISKERS, bool)
     return _source(config.file.stem, digest, time, images[:, None], alive=alive)

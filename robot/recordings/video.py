@@ -59,9 +59,6 @@ def _cropped(crop: Crop, grey: np.ndarray, where: str, key: str) -> np.ndarray:
 
     Args:
         where: the image, for errors. key: configuration key of the crop, for errors.
-
-    Raises:
-        InputError: the crop is empty, or reaches beyond the image.
     """
     height, width = grey.shape
     x_max, y_max = crop.x_max or width, crop.y_max or height

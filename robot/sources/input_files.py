@@ -46,11 +46,7 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The content of a file, at least one byte.
-
-    Raises:
-        InputError: see `require_file`.
-    """
+    """The content of a file, at least one byte."""
     require_file(path)
     with readable(path):
         return path.read_bytes()

@@ -223,11 +223,7 @@ class SourceDescription(ClosedSource):
         return iter(())
 
     def to_json(self) -> str:
-        """The description as a JSON document.
-
-        Raises:
-            TypeError, ValueError: a value in the provenance is not JSON, or a number in it is not finite.
-        """
+        """The description as a JSON document."""
         content = {"view_shape": self.view_shape, "whiskers": self.whiskers, "rate_hz": self.rate_hz}
         return json.dumps(content | {"name": self.name, "info": json.loads(self.info.to_json())})
 

@@ -273,11 +273,7 @@ def make_arena(config: ArenaConfig, seed: int) -> Arena:
 
 
 def place_start(arena: Arena, seed: int) -> Arena:
-    """The arena with another random start in free space.
-
-    Raises:
-        InputError: no start was found.
-    """
+    """The arena with another random start in free space."""
     start = _draw_start(arena, OTHER_START_CLEARANCE, stream(seed, "start"), OTHER_START_TRIES)
     if start is None:
         room = f"{OTHER_START_CLEARANCE:g} m of free space"

@@ -233,14 +233,7 @@ def read_maze(path: Path) -> Maze:
 
 
 def parse_maze(text: str, path: Path) -> Maze:
-    """The maze in a text.
-
-    Args:
-        path: of the text, for errors.
-
-    Raises:
-        InputError: the text has an unexpected character, or lacks an outer wall.
-    """
+    """The maze in a text."""
     lines = [line.rstrip() for line in text.rstrip().splitlines()]
     skipped = next((number for number, line in enumerate(lines) if line), 0)
     lines = lines[skipped:]
@@ -342,11 +335,7 @@ def exploration_route(
 
 
 def winding_loop(columns: int, rows: int, random: np.random.Generator) -> list[Cell]:
-    """A random loop through each cell of a rectangle once: the way around a random tree of 2 x 2 blocks.
-
-    Args:
-        columns, rows: even.
-    """
+    """A random loop through each cell of a rectangle once: the way around a random tree of 2 x 2 blocks."""
     tree = tree_maze(columns // 2, rows // 2, random)
     way: list[Cell] = [(0, 0)]
     while len(way) < columns * rows:

@@ -267,11 +267,7 @@ def other_surroundings(scene: Scene, config: MazeConfig, head: Head, seed: int) 
 
 
 def _check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surroundings:
-    """Walls for contact queries, after checking that no whisker at rest is inside a wall along the path.
-
-    Raises:
-        InputError: a whisker is inside a wall, or the walls are higher than the head.
-    """
+    """Walls for contact queries, after checking that no whisker at rest is inside a wall along the path."""
     hangs, tallest = float(head.base[:, 2].min()), float(boxes.height.max())
     if tallest >= hangs:
         expected = f"less than {hangs:g} m, the height of the head"

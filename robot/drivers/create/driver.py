@@ -48,11 +48,7 @@ class ControlLoop:
         self.last_reply: protocol.SensorReply | None = None
 
     def steer(self, forward: float, turn: float) -> None:
-        """Requests a motion, m/s and rad/s; it ends after `patience`.
-
-        Raises:
-            CommandRefused: above the speed limit, not finite, or stopped and not released.
-        """
+        """Requests a motion, m/s and rad/s; it ends after `patience`."""
         right, left = self._config.wheel_speeds(forward, turn)
         with self._lock:
             if self.active_stop and (right or left):
@@ -60,11 +56,7 @@ class ControlLoop:
             self._command = (right, left, self._clock())
 
     def release(self) -> None:
-        """Allows driving again after a stop; the robot stands until the next command.
-
-        Raises:
-            CommandRefused: a lost port or watchdog requires a new driver.
-        """
+        """Allows driving again after a stop; the robot stands until the next command."""
         with self._lock:
             if self.active_stop and self.active_stop.reason in (StopReason.UNPLUGGED, StopReason.UNGUARDED):
                 raise CommandRefused(f"a new driver is required: {self.active_stop}")

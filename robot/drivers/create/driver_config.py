@@ -76,11 +76,7 @@ class StopReason(Enum):
 
 
 class StopEvent(NamedTuple):
-    """A stop of the robot.
-
-    Attributes:
-        reason: of the stop. detail: the finding. time: host's monotonic clock, s.
-    """
+    """A stop of the robot: its reason, the finding, and its time, s on the host's monotonic clock."""
 
     reason: StopReason
     detail: str

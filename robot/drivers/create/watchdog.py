@@ -107,11 +107,7 @@ class Watchdog:
 
 
 def _watch(port: str, patience: float, replug: float) -> None:
-    """Runs the watchdog: stops the wheels once per time-out of the heartbeat (`patience`, s).
-
-    Args:
-        replug: time for which a disconnected port is awaited, s.
-    """
+    """Runs the watchdog: stops the wheels once per time-out of the heartbeat (`patience`, s)."""
     line = open_port(port, exclusive=False)
     beats: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 

@@ -39,10 +39,7 @@ CONNECTION_LOST = ("closed the connection", "Connection reset", "Connection refu
 
 class _ArmProcess:
     """A running `robot.drivers.ur10.rtde_process`. The pipes close at any end of this process; the
-    subprocess then stops the arm and ends.
-
-    Args:
-        shared: file descriptor of the shared memory."""
+    subprocess then stops the arm and ends."""
 
     def __init__(self, shared: int, config: ArmConfig) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115

@@ -276,10 +276,7 @@ class StartupRefused(InputError):
 
 
 def check_controller(config: ArmConfig) -> dashboard.ControllerStatus:
-    """Asks for the status of the controller and checks it.
-
-    Raises:
-        StartupRefused: the controller is not ready."""
+    """Asks for the status of the controller and checks it."""
     try:
         with dashboard.Dashboard(config.host) as connection:
             controller = connection.controller()

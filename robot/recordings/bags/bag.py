@@ -245,11 +245,7 @@ class Bag(AbstractContextManager["Bag"]):
                 yield number, time, content
 
     def since_start(self, received: float) -> float:
-        """s from the start of the recording to a time of receipt, ns.
-
-        Raises:
-            InputError: the bag is damaged.
-        """
+        """s from the start of the recording to a time of receipt, ns."""
         with _damage_errors(self.path):
             return received / 1e9 - self._start
 
@@ -259,11 +255,7 @@ class Bag(AbstractContextManager["Bag"]):
         return min(next(self._raw(topic))[0] for topic in self.topics.values() if topic.total) / 1e9
 
     def receipts(self, topic: Topic) -> Iterator[int]:
-        """The times of receipt, ns, of the messages of a topic of any type.
-
-        Raises:
-            InputError: the bag is damaged.
-        """
+        """The times of receipt, ns, of the messages of a topic of any type."""
         with _damage_errors(self.path):
             for time, _ in self._raw(topic):
                 yield time

@@ -28,11 +28,7 @@ ARRAYS = ("std_msgs/msg/Float32MultiArray", "std_msgs/msg/Float64MultiArray")
 
 
 def _read_touch(bag: Bag, config: TouchTopic) -> Series:
-    """Touch [M, R, C, 1] in 0..1.
-
-    Raises:
-        InputError: the topic does not exist, has another type, or its values do not fill rows and columns.
-    """
+    """Touch [M, R, C, 1] in 0..1."""
     topic = bag.topic(config.topic, "recording.topics.touch", (JOINTS, *ARRAYS))
     where = f"{bag.path}, {topic.name}"
     names, shape, known = config.joints, None, list[str]()
@@ -164,11 +160,7 @@ def _judge(odometry: Series, judge: InputJudge) -> list[InputError]:
 
 
 def _with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
-    """The topics, with those of OpenRatSLAM where only their root is given.
-
-    Raises:
-        InputError: the bag has none of these.
-    """
+    """The topics, with those of OpenRatSLAM where only their root is given."""
     if config.openratslam is None:
         return config
     root = f"/{config.openratslam.strip('/')}"

@@ -187,11 +187,7 @@ def mount_of(bag: Bag, body: str, sensor: str) -> Mount | None:
 
 def _poses_between(bag: Bag, frames: tuple[str, str], role: str, plane: str) -> Series:
     """Poses [M, 3] of a frame in another, at the times of the moving link with most transforms; the other
-    moving links are interpolated. A single link may lie in another plane.
-
-    Raises:
-        InputError: the frames do not exist, are not connected or do not move.
-    """
+    moving links are interpolated. A single link may lie in another plane."""
     parent, child = (frame.lstrip("/") for frame in frames)
     links = read_links(bag, MOVING) | read_links(bag, STATIC)
     there = sorted({frame for pair in links for frame in pair})
@@ -253,11 +249,7 @@ TURNED = 0.5
 
 
 def read_odometry(bag: Bag, config: OdometryTopic) -> Series:
-    """The odometry: motions [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous sample.
-
-    Raises:
-        InputError: the topic does not exist or has no odometry.
-    """
+    """The odometry: motions [N, 4] (dx m, dy m, dtheta rad, dt s) since the previous sample."""
     series = read_poses(bag, config, "odometry")
     time, values, errors = series.time, series.values, series.errors
     if len(time) < 2 and not errors:

@@ -263,11 +263,7 @@ def cloud_view(
 
 
 def cloud_points(message: Any, where: str) -> np.ndarray:
-    """[N, 3] points of a PointCloud2 in the frame of the sensor, m.
-
-    Raises:
-        InputError: as `cloud_view`.
-    """
+    """[N, 3] points of a PointCloud2 in the frame of the sensor, m."""
     fields = {field.name: field for field in message.fields}
     if not {"x", "y", "z"} <= fields.keys():
         raise InputError(where, f"a cloud of {', '.join(fields) or 'no fields'}", "fields x, y and z")

@@ -219,11 +219,7 @@ class _CreateStep(NamedTuple):
 
 
 class _CreateRobot:
-    """The Create among walls [S, 4] (x1, y1, x2, y2, m).
-
-    Attributes:
-        whiskers: its whiskers.
-    """
+    """The Create among walls [S, 4] (x1, y1, x2, y2, m)."""
 
     def __init__(
         self, config: CreateSimulationConfig, walls: np.ndarray, random: np.random.Generator

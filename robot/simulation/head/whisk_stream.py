@@ -91,11 +91,7 @@ def simulate_free_cycles(
     random: np.random.Generator,
     baseline: Baseline | None = None,
 ) -> list[Cycle]:
-    """A calibration record: `count` cycles in free air with open-loop whisking.
-
-    Args:
-        baseline: as in `simulate_cycles`.
-    """
+    """A calibration record: `count` cycles in free air with open-loop whisking."""
     setup = setup._replace(whisking=setup.whisking.model_copy(update={"mode": "open"}))
     start, threshold = np.arange(count) / setup.whisking.rate, np.full(len(setup.head.length), np.inf)
     still = HeadPath(start, np.zeros((count, 3)))

@@ -47,9 +47,6 @@ class MotionConfig(Settings):
 def check_path(path: RatPath, config: MotionConfig, place: RowName) -> None:
     """Checks a path.
 
-    Args:
-        place: position of a row, for errors.
-
     Raises:
         InputErrors: a value is not finite, times do not increase, a gap is too long, or a speed is beyond
             that of a rat.
