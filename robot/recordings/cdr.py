@@ -2,8 +2,10 @@
 
 A message has four bytes (00 01 00 00) and the fields of its schema (`SCHEMAS`) back to back; an unbounded
 array is preceded by its length (uint32). float64 values keep every bit. Every file stores the schemas, whose
-fields are ordered so that CDR needs no padding. A changed text, even in a comment, is another format. A message
-is one NumPy record: rosbags writes the same bytes, but knows no shapes, and checking these takes as much code.
+fields are ordered so that CDR needs no padding. A changed text, even in a comment, is another format.
+
+A message is one NumPy record. rosbags writes the same bytes, but knows no shapes, and to check these takes as
+much code.
 
 Live data are blocks of frames and of arm states, cuts and events. Frames are stored channel by channel as
 differences from frame to frame: small numbers, which compress well.

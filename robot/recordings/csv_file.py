@@ -1,8 +1,7 @@
 """A CSV file of numbers with a header row, with the line number of each row.
 
-`numpy.loadtxt` parses files of numbers only. Other files are parsed here, because pandas knows no line numbers,
-fills a short row with NaN without a word, and refuses a whole file for one long row or open quotation mark.
-"""
+`numpy.loadtxt` parses files of numbers only. Other files are parsed here, because pandas knows no line
+numbers, X"""
 
 from __future__ import annotations
 
