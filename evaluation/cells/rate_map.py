@@ -18,8 +18,11 @@ from scipy.sparse import csr_array
 from evaluation.cells.recording import BinnedSums, CellRecording
 from tactile.base.errors import InputError
 
+LEAST_SECONDS = 0.1
+"""Time in a bin from which it has a rate, s."""
 
-def rate_maps(sums: BinnedSums, smoothing: float = 1.5, least_seconds: float = 0.1) -> np.ndarray:
+
+def rate_maps(sums: BinnedSums, smoothing: float = 1.5, least_seconds: float = LEAST_SECONDS) -> np.ndarray:
     """[cells, H, W] mean activity, NaN in bins visited for less than `least_seconds`.
 
     Args:
@@ -37,11 +40,8 @@ def rate_maps(sums: BinnedSums, smoothing: float = 1.5, least_seconds: float = 0
     return rates
 
 
-def tuning_curves(sums: BinnedSums, smoothing: float = 0.0, least_seconds: float = 0.1) -> np.ndarray:
-    """[cells, B] mean activity at each heading, NaN at headings held for less than `least_seconds`.
-
-    Args:
-        smoothing: standard deviation of the Gaussian round the circle, bins; 0 for none.
+def tuning_curves(sums: BinnedSums) -> np.ndarray:
+    """[cells, B] mean activity at each heading, NaN at headings held for less than `LEAST_SECONDS`.
 
     Raises:
         InputError: the sums do not fit each other, or no heading was held long enough.
@@ -49,10 +49,8 @@ def tuning_curves(sums: BinnedSums, smoothing: float = 0.0, least_seconds: float
     if sums.heading.shape[1:] != sums.heading_seconds.shape:
         found, expected = f"{sums.heading.shape[1]} bins", f"{len(sums.heading_seconds)} of heading_seconds"
         raise InputError("sums.heading", found, expected)
-    visited = _visited(sums.heading_seconds, least_seconds)
-    kernel = _kernel(len(visited), smoothing, "wrap").T
-    seconds = np.where(visited, sums.heading_seconds @ kernel, np.nan)
-    return (sums.heading @ kernel) / seconds
+    visited = _visited(sums.heading_seconds, LEAST_SECONDS)
+    return sums.heading / np.where(visited, sums.heading_seconds, np.nan)
 
 
 def smooth_rates(rates: np.ndarray, seconds: np.ndarray, sigma: float) -> np.ndarray:
@@ -77,7 +75,7 @@ def smooth_plane(values: np.ndarray, sigma: float) -> np.ndarray:
     spread; smooth `numpy.nan_to_num(values)` and the mask of visited bins and divide to ignore them.
     """
     height, width = values.shape[-2:]
-    return _kernel(height, sigma, "reflect") @ values @ _kernel(width, sigma, "reflect").T
+    return _kernel(height, sigma) @ values @ _kernel(width, sigma).T
 
 
 class BoxSamples(NamedTuple):
@@ -295,12 +293,12 @@ def _visited(seconds: np.ndarray, least_seconds: float) -> np.ndarray:
     return visited
 
 
-def _kernel(bins: int, sigma: float, mode: str) -> np.ndarray:
+def _kernel(bins: int, sigma: float) -> np.ndarray:
     """[bins, bins] matrix that smooths a column of `bins` values."""
     eye = np.eye(bins)
     from scipy.ndimage import gaussian_filter1d  # slow to import
 
-    return gaussian_filter1d(eye, sigma, axis=0, mode=mode, truncate=4.0) if sigma > 0 else eye
+    return gaussian_filter1d(eye, sigma, axis=0, mode="reflect", truncate=4.0) if sigma > 0 else eye
 
 
 def coherence(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from functools import partial
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -213,6 +216,13 @@ BACKENDS = ("recall", "classic")
 SESSION_FILES = ("touch.csv", "buildings.csv")
 """Files of the sessions of tables, which may be in one folder."""
 
+TABLES = {
+    "touch": "touch_table.touch_table", "grid": "grid_table.grid_table", "laser": "buildings.laser_table",
+    "buildings": "buildings.buildings_table", "health": "health.health_table",
+    "closures": "closures.closures_table", "speed": "speed.speed_table", "cycles": "cycles.cycle_table",
+    "batches": "batches.batch_table",
+}  # fmt: skip
+"""Functions of the tables, in the folder `tables`."""
 TIMED = ("speed", "cycles", "batches")
 """Tables of times."""
 
@@ -289,63 +299,18 @@ def _add_against(parser: CommandParser, file: str) -> None:
 
 
 def _print_table(arguments: argparse.Namespace) -> None:
+    """Prints a table, each line as soon as it is measured.
+
+    Its function takes the options of its command. Only its modules are loaded, those of a table of times once
+    the process is on one core.
+    """
     prepare_jax(keep_compiled=False)
-    lines = _timed_lines if arguments.table in TIMED else _table_lines
-    for line in lines(arguments.table, arguments):
-        print(line, flush=True)
-    if arguments.file and arguments.output is not None:
-        print(f"\nwrote {arguments.output / arguments.file}")
-
-
-def _table_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
-    """The lines of a table, each as soon as it is measured; only the modules of that table are loaded."""
-    from evaluation.papers.tables.markdown import select_rows
-
-    if name == "touch":
-        from evaluation.papers.tables import touch_table as touch
-
-        rows = select_rows(arguments.rows, touch.ROWS, touch.DEFAULT_ROWS)
-        first, sessions, files = arguments.first, arguments.sessions, (arguments.output, arguments.against)
-        return touch.touch_table(rows, first, sessions, arguments.workers, arguments.backend, files)
-    if name == "grid":
-        from evaluation.papers.tables import grid_table as grid
-
-        places = grid.DEFAULT_ROWS
-        if arguments.rows or arguments.worlds:
-            names = select_rows(arguments.rows, grid.ROWS, tuple(grid.ODOMETRY_ERRORS))
-            places = tuple((world, row) for world in arguments.worlds or "AB" for row in names)
-        return grid.grid_table(places, arguments.arenas, arguments.first, arguments.workers)
-    if name in ("laser", "buildings"):
-        from evaluation.papers.tables import buildings
-
-        copies, workers = arguments.copies, arguments.workers
-        if name == "laser":
-            return buildings.laser_table(select_rows(arguments.rows, buildings.ROWS), copies, workers)
-        files = arguments.output, arguments.against
-        return buildings.buildings_table(buildings.choose_rows(arguments.rows), copies, workers, files=files)
-    if name == "health":
-        from evaluation.papers.tables.health import health_table
-
-        return health_table(arguments.sessions, arguments.workers)
-    from evaluation.papers.tables.closures import closures_table
-
-    return closures_table(arguments.sessions, arguments.workers, arguments.output)
-
-
-def _timed_lines(name: str, arguments: argparse.Namespace) -> Iterator[str]:
-    """The lines of a table of times; the process is kept on one core before its modules are loaded."""
     from evaluation.studies.machine import one_core
 
-    with one_core():
-        from evaluation.papers.tables.batches import batch_table
-        from evaluation.papers.tables.cycles import cycle_table, profile_table
-        from evaluation.papers.tables.speed import SIZES, speed_table
-
-        if name == "speed":
-            yield from speed_table(arguments.rows or SIZES, arguments.rounds)
-        elif name == "batches":
-            yield from batch_table(arguments.sets, arguments.sessions, arguments.steps, arguments.rounds)
-        elif arguments.profile:
-            yield from profile_table(arguments.rows)
-        else:
-            yield from cycle_table(arguments.rows, arguments.rounds)
+    module, function = TABLES[arguments.table].split(".")
+    with one_core() if arguments.table in TIMED else nullcontext():
+        measure = getattr(import_module(f"evaluation.papers.tables.{module}"), function)
+        for line in measure(**{name: getattr(arguments, name) for name in signature(measure).parameters}):
+            print(line, flush=True)
+    if arguments.file and arguments.output is not None:
+        print(f"\nwrote {arguments.output / arguments.file}")

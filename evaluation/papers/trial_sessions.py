@@ -51,29 +51,19 @@ from tactile.wall_estimation.report_frontend import ReportFrontend, ReportFronte
 from tactile.whisker_geometry import PlanarWhiskers
 
 
-def collect_session(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
+def collect_session(config: RunConfig, every: bool = True) -> tuple[RunConfig, InMemorySource]:
     """The configuration completed by its source, and the whole source in memory.
 
+    Args:
+        every: whether every step needs a true pose.
+
     Raises:
-        InputError: the source cannot be read or simulated, or lacks the true pose of a step.
+        InputError: the source cannot be read or simulated, or lacks true poses.
     """
     with open_observations(config) as (config, source):
         log = load_into_memory(source)
-    if log.truth is None or not np.isfinite(log.truth).all():
+    if log.truth is None or (every and not np.isfinite(log.truth).all()):
         raise InputError(log.name, "steps without a true pose", "the true pose of every step")
-    return config, log
-
-
-def collect_recording(config: RunConfig) -> tuple[RunConfig, InMemorySource]:
-    """The same of a recording, of which some steps may lack the true pose.
-
-    Raises:
-        InputError: the recording cannot be used, or has no truth.
-    """
-    with open_observations(config) as (config, source):
-        log = load_into_memory(source)
-    if log.truth is None:
-        raise InputError(log.name, "no true poses", "a recording with truth")
     return config, log
 
 
@@ -181,7 +171,7 @@ def run_recording(
     Raises:
         InputError: the recording cannot be used, or has no truth.
     """
-    config, log = collect_recording(config)
+    config, log = collect_session(config, every=False)
     if perturbation is not None:
         log = perturbation(log, seed)
     session = build_session(config, log)

@@ -21,10 +21,10 @@ import numpy as np
 
 from evaluation.papers.cells.panels import name_panel, panel_grid, time_call
 from evaluation.papers.figure import Figure, Task
-from evaluation.papers.tables.buildings import FALSE_DISTANCE
+from evaluation.papers.tables import buildings
+from evaluation.papers.tables.comparison import Measured, column
 from evaluation.papers.tables.markdown import table_lines
-from evaluation.papers.tables.recordings import Recording
-from evaluation.papers.tables.touch_table import SessionFigures, TouchTask, run_and_measure, task_config
+from evaluation.papers.tables.touch_table import TouchTask, run_and_measure, task_config
 from evaluation.papers.trial_sessions import closure_claims, collect_session, new_session, run_recording
 from evaluation.plots import style
 from evaluation.studies.executor import run_tasks
@@ -55,7 +55,7 @@ SPAN = 2.0
 """Side of the square over which random ties are spread, m."""
 SILENT = (0.05, 0.1, 0.2, 0.3)
 """Shares of silent cells."""
-INTEL = Recording("Intel", "configs/intel_laser.yaml", real=True)
+INTEL = buildings.ROWS["intel"]
 COLOURS = (style.VERMILLION, style.BLUE)
 COLUMNS = (
     "lesion", "sessions", "revisits closed", "closures, false", "of the intact closures", "EM", "ARR",
@@ -174,7 +174,7 @@ GOALS = {
 }
 
 
-_Lesioned = tuple[SessionFigures | None, float, int]
+_Lesioned = tuple[Measured | None, float, int]
 """Figures of a session, None for Intel; share of the closures of the intact network that are in it too, pair
 for pair, NaN if there are none; number of its closures that are true."""
 _Lesions = Mapping[tuple[str, str], list[_Lesioned]]
@@ -197,7 +197,7 @@ def measure_lesions(
     return found
 
 
-def _run_lesion(task: tuple[str, str, int]) -> tuple[SessionFigures | None, set[tuple[int, ...]], int]:
+def _run_lesion(task: tuple[str, str, int]) -> tuple[Measured | None, set[tuple[int, ...]], int]:
     """Runs one session with its lesion: its figures, its closures, and how many of them are true."""
     lesion, row, maze = task
     if lesion == EXCHANGED:
@@ -208,7 +208,7 @@ def _run_lesion(task: tuple[str, str, int]) -> tuple[SessionFigures | None, set[
         if not row:
             _, session, run = run_recording(INTEL.configuration())
             claims = closure_claims(session.map, run.truth)
-            true = int((claims.accepted & (claims.distance <= FALSE_DISTANCE)).sum())
+            true = int((claims.accepted & (claims.distance <= buildings.FALSE_DISTANCE)).sum())
             return None, {(step,) for step in np.flatnonzero(claims.accepted).tolist()}, true
         result, figures = run_and_measure(TouchTask(row, maze), new_session)
     true = int((closure_errors(result.truth, result.closures) <= FALSE_CLOSURE_DISTANCE).sum())
@@ -263,33 +263,29 @@ def _table_lesions(result: _Lesions) -> list[str]:
     return table_lines([above], COLUMNS, rows, [below])
 
 
-def _closed(sessions: Sequence[SessionFigures]) -> tuple[str, str]:
+def _closed(sessions: Sequence[Measured]) -> tuple[str, str]:
     """Median share of revisits closed; sums of closures and of false ones."""
-    closures, false = (
-        sum(getattr(one.metrics, name) for one in sessions) for name in ("closures", "false_closures")
-    )
-    return f"{np.nanmedian([one.revisits_closed for one in sessions]):.2f}", f"{closures}, {false}"
+    closures, false = (column(sessions, name).sum() for name in ("closures", "false_closures"))
+    return f"{np.nanmedian(column(sessions, 'revisits_closed')):.2f}", f"{closures}, {false}"
 
 
-def _errors(sessions: Sequence[SessionFigures]) -> list[str]:
+def _errors(sessions: Sequence[Measured]) -> list[str]:
     """Medians of EM and ARR."""
-    return [f"{np.median([getattr(one.metrics, name) for one in sessions]):.3f}" for name in ("em", "arr")]
+    return [f"{np.median(column(sessions, name)):.3f}" for name in ("em", "arr")]
 
 
 def _draw_lesions(result: _Lesions, png: Path) -> None:
     """Share of revisits closed, and EM, of every lesion."""
     lesions, rows = _lesions_and_rows(result)
-    panels: tuple[tuple[str, str, Callable[[Any], float]], ...] = (
-        ("revisits closed", "share", lambda one: one.revisits_closed),
-        ("EM", "m² + rad²", lambda one: one.metrics.em),
-    )
+    panels = ("revisits closed", "share", "revisits_closed"), ("EM", "m² + rad²", "em")
     line = f"Median, dots: mazes. {lesions[0]}: the network as it is."
     figure, axes = panel_grid("Lesions of the network", line, 1, 2, height=3.0)
     at = np.arange(len(lesions))
-    for panel, (title, across, value) in zip(axes[0], panels, strict=True):
+    for panel, (title, across, name) in zip(axes[0], panels, strict=True):
         for k, row in enumerate(rows):
             colour = COLOURS[k % len(COLOURS)]
-            found = [[value(one) for one, _, _ in result[lesion, row]] for lesion in lesions]
+            sessions = ([one for one, _, _ in result[lesion, row] if one is not None] for lesion in lesions)
+            found = [column(each, name) for each in sessions]
             up = at + 0.2 - 0.4 * k
             panel.barh(up, np.nanmedian(found, axis=1), 0.36, color=colour, alpha=0.35, label=row)
             for y, group in zip(up, found, strict=True):
@@ -316,7 +312,7 @@ CALLS = 20
 
 _Network = tuple[int, float, bool]
 """Cells along x and y, size of a cell, m, and whether the network grows with the map."""
-_Sized = tuple[SessionFigures, tuple[int, int], float]
+_Sized = tuple[Measured, tuple[int, int], float]
 """Figures of a session; cells along x and y at its end; time of the network's part of an update with the
 keyframes at its end, us."""
 _Sizes = Mapping[_Network, list[_Sized]]
@@ -413,7 +409,9 @@ def _draw_sizes(result: _Sizes, png: Path) -> None:
     line = f"The usual network has {SIDE} cells of {CELL:g} m along x and y, and grows."
     figure, axes = panel_grid("Numbers and sizes of cells", line, 1, 2, height=2.6)
     for (label, group), colour in zip(groups.items(), COLOURS + (style.GREEN,), strict=True):
-        closed = [np.nanmedian([one.revisits_closed for one, *_ in each]) for each in group.values()]
+        closed = [
+            np.nanmedian(column([one for one, *_ in each], "revisits_closed")) for each in group.values()
+        ]
         update = [np.median([time for *_, time in each]) for each in group.values()]
         axes[0][0].plot([side for side, *_ in group], closed, "o-", ms=4, color=colour, label=label)
         axes[0][1].plot(update, closed, "o", ms=5, color=colour)

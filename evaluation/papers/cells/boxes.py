@@ -9,7 +9,6 @@ maps of all cells are therefore compared as they are and after the best turn and
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -134,13 +133,13 @@ def _parts(maps: np.ndarray) -> np.ndarray:
     return np.array([known.astype(float), values, values**2])
 
 
-KINDS, PAIRS = ("columns", "single cells"), ("A with A", "A with B")
+PAIRS = "A with A", "A with B"
 _Fit = tuple[dict[str, np.ndarray], float, tuple[int, int]]
 """Correlations [n] of maps as they are (`still`) and after the best common turn and shift (`best`), each also
 with the identities of the cells shuffled (`shuffled still`, ...); that turn, rad, and that shift, bins."""
-_Session = tuple[np.ndarray, dict[tuple[str, str], _Fit], float]
-"""Maps [3, n, H, W] of columns in A, in A again and in B; the fits of `KINDS` and `PAIRS`; turn of the sheet
-against B as the rat was set down, rad."""
+_Session = tuple[np.ndarray, dict[str, _Fit], float]
+"""Maps [3, n, H, W] of columns in A, in A again and in B; the fits of `PAIRS`; turn of the sheet against B as
+the rat was set down, rad."""
 _Boxes = tuple[list[_Session], float, float]
 
 
@@ -169,19 +168,15 @@ def _fit_session(recording: CellRecording, seconds: float, side: float, columns:
     count = round(side / recording.cell_size)
     edges = np.linspace(0.0, side, count + 1)
     part = np.minimum((recording.time - recording.time[0]) // seconds, 2)
-    maps: dict[str, list[np.ndarray]] = {}
-    for kind, activity in zip(KINDS, column_activity(recording.activity, columns), strict=True):
-        maps[kind] = [
-            rate_maps(bin_activity(recording.time[here], recording.truth[here], activity[here], edges, edges))
-            for here in (part == number for number in range(3))
-        ]
-    fits = {
-        (kind, pair): fit_maps(maps[kind][k], maps[kind][k + 1], recording.shape[2])
-        for kind, (k, pair) in product(KINDS, enumerate(PAIRS))
-    }
+    activity = column_activity(recording.activity, columns)
+    maps = [
+        rate_maps(bin_activity(recording.time[here], recording.truth[here], activity[here], edges, edges))
+        for here in (part == number for number in range(3))
+    ]
+    fits = {pair: fit_maps(maps[k], maps[k + 1], recording.shape[2]) for k, pair in enumerate(PAIRS)}
     after = int(np.flatnonzero(part == 2)[0])
     turn = wrap(recording.truth[after - 1, 2] - recording.truth[after, 2])
-    return np.array(maps["columns"]), fits, float(turn)
+    return np.array(maps), fits, float(turn)
 
 
 def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> _Fit:
@@ -201,8 +196,8 @@ def fit_maps(first: np.ndarray, second: np.ndarray, bins: int) -> _Fit:
 def _table_boxes(result: _Boxes) -> list[str]:
     sessions, side, torus = result
 
-    def spread(kind: str, pair: str, name: str) -> str:
-        means = [_mean(fits[kind, pair][0][name]) for _, fits, _ in sessions]
+    def spread(pair: str, name: str) -> str:
+        means = [_mean(fits[pair][0][name]) for _, fits, _ in sessions]
         return f"{np.mean(means):.2f} ({min(means):.2f} to {max(means):.2f})"
 
     whole = "far above the control: the sheet turns and shifts as a whole"
@@ -212,10 +207,10 @@ def _table_boxes(result: _Boxes) -> list[str]:
         ("A with B", "best common turn and shift", whole, "best"),
     )
     rows = []
-    for kind, (pair, how, goal, name) in product(KINDS, figures):
-        control = f"{spread(kind, pair, f'shuffled {name}')} shuffled identities"
-        rows.append([f"{kind}: {pair}, {how}", goal, spread(kind, pair, name), control])
-    found = ", ".join(f"{np.degrees(wrap(fits['columns', 'A with B'][1])):.0f}" for _, fits, _ in sessions)
+    for pair, how, goal, name in figures:
+        control = f"{spread(pair, f'shuffled {name}')} shuffled identities"
+        rows.append([f"columns: {pair}, {how}", goal, spread(pair, name), control])
+    found = ", ".join(f"{np.degrees(wrap(fits['A with B'][1])):.0f}" for _, fits, _ in sessions)
     down = ", ".join(f"{np.degrees(turn):.0f}" for _, _, turn in sessions)
     rows.append(["common turn, degrees", "that of setting down", found, f"{down} set down"])
     rows.append(["box over torus", "-", f"{side:.2f} / {torus:.2f} m = {side / torus:.2f}", "-"])
@@ -246,11 +241,11 @@ def _draw_boxes(result: _Boxes, png: Path) -> None:
     """Maps of some columns in each box, and histograms of the correlations of all columns."""
     sessions, side, torus = result
     maps, fits, _ = sessions[0]
-    _, angle, shift = fits["columns", "A with B"]
+    _, angle, shift = fits["A with B"]
 
     def correlations(pair: str, name: str) -> np.ndarray:
         """Of all columns of all sessions that have one."""
-        joined = np.concatenate([fits["columns", pair][0][name] for _, fits, _ in sessions])
+        joined = np.concatenate([fits[pair][0][name] for _, fits, _ in sessions])
         return joined[np.isfinite(joined)]
 
     pairs = {

@@ -114,9 +114,6 @@ def record_rat(
     return recording._replace(cell=recording.cell[kept], activity=recording.activity[:, kept])
 
 
-def column_activity(activity: np.ndarray, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Activity [T, columns] of columns, from that of their cells [T, C]: sums over a column, and that of one
-    cell of each, at a heading that differs from column to column."""
-    split = activity.reshape(len(activity), columns, -1)
-    at = np.arange(columns)
-    return split.sum(axis=2), split[:, at, at % split.shape[2]]
+def column_activity(activity: np.ndarray, columns: int) -> np.ndarray:
+    """Activity [T, columns] of columns: sums of that of their cells [T, C]."""
+    return activity.reshape(len(activity), columns, -1).sum(axis=2)

@@ -70,8 +70,8 @@ class _LatticeFigures(NamedTuple):
     fields: np.ndarray
 
 
-_Torus = tuple[_LatticeFigures, _LatticeFigures, _LatticeFigures, float]
-"""Columns in the large box, one cell of each, and columns in the small box; side of the torus, m."""
+_Torus = tuple[_LatticeFigures, _LatticeFigures, float]
+"""Columns in the large and in the small box; side of the torus, m."""
 
 
 def measure_torus(
@@ -93,15 +93,11 @@ def measure_torus(
         )
         for size, time in zip((LARGE, SMALL), seconds, strict=True)
     ]  # fmt: skip
-    measure = partial(measure_cells, shuffles=shuffles, seed=task.first)
-    large, small = recordings
-    summed, single = column_activity(large.activity, columns)
-    return (
-        measure(large, summed, LARGE, BINS[0]),
-        measure(large, single, LARGE, BINS[0]),
-        measure(small, column_activity(small.activity, columns)[0], SMALL, BINS[1]),
-        rats.torus,
+    large, small = (
+        measure_cells(each, column_activity(each.activity, columns), size, bin, shuffles, task.first)
+        for each, size, bin in zip(recordings, (LARGE, SMALL), BINS, strict=True)
     )
+    return large, small, rats.torus
 
 
 def measure_cells(
@@ -140,21 +136,18 @@ def measure_cells(
 
 
 def _table_torus(result: _Torus) -> list[str]:
-    large, single, small, torus = result
+    large, small, torus = result
     above = (
         f"{len(large.maps)} columns. Medians over cells, in brackets the 2.5th and 97.5th percentile; "
         "control: median of the 95th percentile of each cell's shuffles, and the share above theirs."
     )
-    rows = [["larger box over torus", "above 1", _ratio(large, torus), "-"]]
-    for name, found in (("columns", large), ("single cells", single)):
-        known = f"shuffles have none; found in {np.isfinite(found.spacing).sum()} of {len(found.maps)}"
-        square, hexagonal = found.square, found.hexagonal
-        rows += [
-            [f"{name}: spacing m", f"side of the torus, {torus:.2f}", _spread(found.spacing, 3), known],
-            [f"{name}: square score", "above control", _spread(square.score), _control(square)],
-            [f"{name}: grid score", "no grid cell", _spread(hexagonal.score), _control(hexagonal)],
-        ]
-    rows += [
+    known = f"shuffles have none; found in {np.isfinite(large.spacing).sum()} of {len(large.maps)}"
+    square, hexagonal = large.square, large.hexagonal
+    rows = [
+        ["larger box over torus", "above 1", _ratio(large, torus), "-"],
+        ["columns: spacing m", f"side of the torus, {torus:.2f}", _spread(large.spacing, 3), known],
+        ["columns: square score", "above control", _spread(square.score), _control(square)],
+        ["columns: grid score", "no grid cell", _spread(hexagonal.score), _control(hexagonal)],
         ["columns: fields", "several", _counts(large.fields), "-"],
         ["smaller box over torus", "below 1", _ratio(small, torus), "-"],
         ["columns: fields", "one or none", _counts(small.fields), "-"],
@@ -171,7 +164,7 @@ def _table_torus(result: _Torus) -> list[str]:
 
 def _draw_torus(result: _Torus, png: Path) -> None:
     """A row of maps and one of autocorrelograms for each box; histograms of the scores in the larger."""
-    large, _, small, torus = result
+    large, small, torus = result
     values = (large.spacing, large.square.score, large.hexagonal.score)
     spacing, square, hexagonal = (float(np.nanmedian(each)) for each in values)
     line = (

@@ -17,8 +17,10 @@ import numpy as np
 from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import RIGHT, WRONG, MapSteps
 from evaluation.papers.maps.localising import Judged
-from evaluation.papers.maps.operations import Localised, MapTask, Measured, column
-from evaluation.papers.maps.pictures import at_least, count, draw_panels, median, spread, table
+from evaluation.papers.maps.operations import Localised, MapTask
+from evaluation.papers.maps.pictures import at_least, draw_panels, median, spread, table
+from evaluation.papers.tables.comparison import Measured, column
+from evaluation.papers.tables.markdown import count
 from evaluation.papers.trial_sessions import simulate_session
 from evaluation.studies.machine import code_digest
 from ratslam.runs.build_session import build_session, open_observations

@@ -17,9 +17,11 @@ from evaluation.papers.figure import Figure
 from evaluation.papers.maps import scenarios
 from evaluation.papers.maps.localising import Judged
 from evaluation.papers.maps.merged_maps import Join
-from evaluation.papers.maps.operations import MapTask, Measured, column
-from evaluation.papers.maps.pictures import PathPanel, at_least, count, draw_panels, spread, table
+from evaluation.papers.maps.operations import MapTask
+from evaluation.papers.maps.pictures import PathPanel, at_least, draw_panels, spread, table
 from evaluation.papers.maps.scenarios import LOCALISED, REENTERED, Recipe, Recorded, record
+from evaluation.papers.tables.comparison import Measured, column
+from evaluation.papers.tables.markdown import count
 from evaluation.papers.trial_sessions import apply_control
 from robot.world.maze import CELL_SIDE
 

@@ -18,10 +18,12 @@ import numpy as np
 
 from evaluation.papers.figure import Figure
 from evaluation.papers.maps.localisation_metrics import RIGHT
-from evaluation.papers.maps.operations import MapTask, Measured
-from evaluation.papers.maps.pictures import PathPanel, count, draw_panels, median, spread, table
+from evaluation.papers.maps.operations import MapTask
+from evaluation.papers.maps.pictures import PathPanel, draw_panels, median, spread, table
 from evaluation.papers.maps.scenarios import Recipe, ten_circuits
 from evaluation.papers.maps.stored_maps import StoredMap
+from evaluation.papers.tables.comparison import Measured
+from evaluation.papers.tables.markdown import count
 from ratslam.live.goal_drive import DriveState, GoalDrive, GoalRoute
 from ratslam.live.goal_planner import GoalPlanner, contact_map, felt_points
 from ratslam.places.localiser import Localiser

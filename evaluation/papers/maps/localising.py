@@ -11,9 +11,11 @@ import numpy as np
 from evaluation.papers.figure import Figure
 from evaluation.papers.maps import scenarios
 from evaluation.papers.maps.localisation_metrics import RIGHT, WRONG, MapSteps, pose_errors
-from evaluation.papers.maps.operations import Localised, MapTask, Measured, column
-from evaluation.papers.maps.pictures import PathPanel, at_least, count, draw_panels, median, spread, table
+from evaluation.papers.maps.operations import Localised, MapTask
+from evaluation.papers.maps.pictures import PathPanel, at_least, draw_panels, median, spread, table
 from evaluation.papers.maps.scenarios import FOREIGN, LOCALISED, record
+from evaluation.papers.tables.comparison import Measured, column
+from evaluation.papers.tables.markdown import count
 from evaluation.papers.trial_sessions import apply_control
 from tactile.base.se2 import integrate
 

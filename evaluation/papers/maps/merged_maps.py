@@ -16,10 +16,12 @@ import numpy as np
 from evaluation.papers.figure import Figure
 from evaluation.papers.maps import localisation_metrics as metrics
 from evaluation.papers.maps import scenarios
-from evaluation.papers.maps.operations import MapTask, Measured, column
-from evaluation.papers.maps.pictures import PathPanel, at_least, count, draw_panels, spread, table
+from evaluation.papers.maps.operations import MapTask
+from evaluation.papers.maps.pictures import PathPanel, at_least, draw_panels, spread, table
 from evaluation.papers.maps.scenarios import Recipe, record
 from evaluation.papers.maps.stored_maps import MapArrays, StoredMap
+from evaluation.papers.tables.comparison import Measured, column
+from evaluation.papers.tables.markdown import count
 from evaluation.papers.tables.recordings import metres
 from ratslam.runs.settings.packaged import find_config
 from ratslam.runs.settings.run_config import load_config

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from evaluation.papers.figure import MAPS, Figure, find_figure, write_page
 from evaluation.papers.maps.scenarios import Recipe, Recorded
 from evaluation.papers.maps.stored_maps import STEPS, MapArrays, StoredMap, store_map
-from evaluation.papers.tables.comparison import Record, SessionLog, compare_figures
+from evaluation.papers.tables.comparison import Measured, SessionLog, compare_figures, measured_rows, some_of
 from evaluation.papers.trial_sessions import capacity_for
-from evaluation.studies.executor import run_tasks
 from ratslam.core.session import Session
 from ratslam.grid.localiser import GridLocaliser
 from ratslam.places.localiser import Localisation, Localiser
@@ -48,23 +47,6 @@ class Localised(NamedTuple):
         states = localiser.states()
         pose = np.array([step.pose for step in steps])
         return cls(states == Localisation.FOUND, states == Localisation.NOT_THIS_MAP, pose)
-
-
-class Measured(NamedTuple):
-    """What a row measures of one session.
-
-    Attributes:
-        record: its figures by name, of which `True` is a failure. shown: what its table and its picture show
-            besides, by name.
-    """
-
-    record: Record
-    shown: Mapping[str, Any]
-
-
-def column(found: Sequence[Measured], name: str) -> np.ndarray:
-    """[n] a figure of all sessions, recorded or shown."""
-    return np.array([one.record[name] if name in one.record else one.shown[name] for one in found])
 
 
 class MapTask(NamedTuple):
@@ -165,25 +147,20 @@ def reproduce_maps(
     Raises:
         InputError: a session cannot be recorded, or a file of the sessions cannot be used.
     """
-    labels: dict[str, dict[int, str]] = {}  # of the sessions of each figure by seed, or number of a recording
+    tasks: dict[str, dict[str, MapTask]] = {}
     for name in names:
         usual = find_figure(MAPS[name]).sessions
+        seeds: Iterable[tuple[str, int]]  # or the numbers of the recordings
         if isinstance(usual, int):
-            labels[name] = {seed: str(seed) for seed in range(first, first + (sessions or usual))}
+            seeds = ((str(seed), seed) for seed in range(first, first + (sessions or usual)))
         else:
-            labels[name] = dict(enumerate(usual[:sessions]))
-    planned = [(name, label) for name in names for label in labels[name].values()]
-    log = SessionLog("maps", (output, against), planned)
+            seeds = ((label, number) for number, label in enumerate(usual[:sessions]))
+        tasks[name] = {label: MapTask(seed, output / "maps", methods) for label, seed in seeds}
+    log = SessionLog("maps", output, against, tasks)
 
     def measure(name: str, figure: Figure) -> tuple[list[str], list[Measured]]:
-        used = list(labels[name].values())
-        tasks = [MapTask(seed, output / "maps", methods) for seed in labels[name]]
-        found = []
-        for label, figures in zip(used, run_tasks(figure.measure, tasks, workers=workers), strict=True):
-            log.add(name, label, figures.record)
-            found.append(figures)
-        named = ", ".join(used if len(used) < 3 else (used[0], "...", used[-1]))
-        return [f"{len(tasks)} sessions: {named}.", ""], found
+        ((_, found),) = measured_rows(figure.measure, {name: tasks[name]}, workers, log)
+        return [f"{len(found)} sessions: {some_of(tasks[name])}.", ""], found
 
     yield from write_page(output / "maps.md", MAPS, names, measure)
     yield from compare_figures(log, names)

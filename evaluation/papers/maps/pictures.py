@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evaluation.metrics.statistics import wilson_interval
 from evaluation.papers.tables.markdown import markdown_header
 from evaluation.plots import style
 from evaluation.plots.map_plot import draw_walls
@@ -33,15 +32,6 @@ def at_least(share: float, total: int) -> str:
 def median(values: np.ndarray) -> float:
     """Median of values [n]; NaN of none."""
     return float(np.median(values)) if len(values) else np.nan
-
-
-def count(happened: Sequence[bool] | np.ndarray) -> str:
-    """How many of the sessions [n] bool, with the 95 % interval of the rate in percent."""
-    number, total = int(np.sum(happened)), len(happened)
-    if not total:
-        return "-"
-    low, high = wilson_interval(number, total)
-    return f"{number} of {total} [{100 * low:.0f}-{100 * high:.0f} %]"
 
 
 def spread(values: Sequence[float] | np.ndarray, digits: int = 2) -> str:

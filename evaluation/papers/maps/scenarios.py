@@ -14,7 +14,7 @@ import networkx
 import numpy as np
 
 from evaluation.papers.tables.touch_table import KIDNAPS, MAIN, touch_config
-from evaluation.papers.trial_sessions import collect_recording, collect_session
+from evaluation.papers.trial_sessions import collect_session
 from ratslam.runs.settings.run_config import RunConfig
 from robot.sources.in_memory import InMemorySource, cut_log
 from robot.world.maze import CELL_SIDE, Cell, Maze, cell_centre, exploration_route
@@ -62,8 +62,7 @@ def record(recipe: Recipe) -> Recorded:
     Raises:
         InputError: the source cannot be read or simulated, or has no true poses.
     """
-    collect = collect_recording if recipe.config.simulation is None else collect_session
-    config, log = collect(recipe.config)
+    config, log = collect_session(recipe.config, every=recipe.config.simulation is not None)
     return Recorded(config, cut_log(log, recipe.first, recipe.last))
 
 

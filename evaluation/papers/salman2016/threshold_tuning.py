@@ -21,6 +21,7 @@ from evaluation.papers.salman2016.paper_figures import draw_tuning
 from evaluation.papers.trial_sessions import collect_session
 from evaluation.studies.executor import run_tasks
 from evaluation.studies.metrics import ViewDifferences, compare_views, lap_ends
+from evaluation.studies.study_report import csv_text
 from ratslam.classic.view_templates import TemplateConfig
 from ratslam.runs.settings.run_config import RunConfig
 from ratslam.runs.settings.strict_yaml import Document, override, validate
@@ -83,8 +84,7 @@ def tune_threshold(
         chosen = None if winner is None else winner.threshold
         counts = np.array([(one.threshold, one.correct, one.incorrect) for one in scores]).T
         draw_tuning(views, counts, chosen).savefig(plot)
-        lines = [",".join(ThresholdScore._fields), *(",".join(map(repr, each)) for each in scores)]
-        table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        table.write_text(csv_text([score._asdict() for score in scores]), encoding="utf-8")
         yield f"\nwrote {plot} and {table}"
 
 

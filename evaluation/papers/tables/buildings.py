@@ -10,9 +10,9 @@ over its closures are; in the table `laser` if its two steps are 2.5 pose cells 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
-from itertools import islice, product
+from itertools import product
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -20,11 +20,17 @@ import numpy as np
 from scipy.special import expit
 
 from evaluation.metrics.statistics import expected_calibration_error
-from evaluation.papers.tables.comparison import Compared, Files, SessionLog, compare_runs
+from evaluation.papers.tables.comparison import (
+    Compared,
+    Measured,
+    SessionLog,
+    column,
+    compare_runs,
+    measured_rows,
+)
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
 from evaluation.papers.tables.recordings import GOLDEN, Recording, metres, real_recordings
 from evaluation.papers.trial_sessions import ClosureClaims, closure_claims, known_ate, run_recording
-from evaluation.studies.executor import run_tasks
 from evaluation.studies.metrics import closure_errors
 from evaluation.studies.perturbation import Perturbation, miscalibrate, perturb, spoil_labels
 from ratslam.runs.settings.run_config import RunConfig
@@ -78,24 +84,6 @@ class BuildingsRow(NamedTuple):
         return self.recording.configuration(*(f"{key}={value!r}" for key, value in scaled.items()))
 
 
-class RunFigures(NamedTuple):
-    """The figures of one run.
-
-    Attributes:
-        odometry, final, live: ATE, m. closures: [K] bool, of each accepted closure, whether it is false.
-        sequences: [R, 2] bool, of each closure sequence, whether it is accepted and whether it is false.
-            Closures and sequences without known truth do not count as false. odds: [R] log odds that each
-            sequence is true, NaN where they are not known.
-    """
-
-    odometry: float
-    final: float
-    live: float
-    closures: np.ndarray
-    sequences: np.ndarray
-    odds: np.ndarray
-
-
 def buildings_rows() -> dict[str, BuildingsRow]:
     """All rows by name; those of the buildings are the files found in the folder of the real recordings, or
     one row, `buildings`, for a file that is missing."""
@@ -120,52 +108,40 @@ def buildings_rows() -> dict[str, BuildingsRow]:
     return rows
 
 
-def choose_rows(names: Sequence[str] | None) -> dict[str, BuildingsRow]:
-    """The rows with these names or in sections with these names; without names all.
-
-    Raises:
-        InputError: a name that is neither.
-    """
-    rows = buildings_rows()
-    sections: dict[str, BuildingsRow] = {row.section: row for row in rows.values()}
-    chosen = select_rows(names, {**sections, **rows}, tuple(sections))
-    return {name: row for name, row in rows.items() if name in chosen or row.section in chosen}
-
-
 def buildings_table(
-    rows: Mapping[str, BuildingsRow], copies: int = 10, workers: int = 0, files: Files = (None, None)
+    rows: Sequence[str] | None = None,
+    copies: int = 10,
+    workers: int = 0,
+    output: Path | None = None,
+    against: Path | None = None,
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its runs are done; totals and missing recordings below it.
 
     Args:
-        rows: those of `buildings_rows` to print. files: of the runs, `buildings.csv`, and of those to compare
-            them with below the table; a session is the seed of a copy, 0 the recording as it is.
+        rows: names of rows of `buildings_rows` or of sections; None: all. output, against: see `SessionLog`;
+            the file is `buildings.csv`, a session is the seed of a copy, 0 the recording as it is.
 
     Raises:
-        InputError: one of these files cannot be used.
+        InputError: no such row, or a file cannot be used.
     """
-    missing = {name: reason for name, row in rows.items() if (reason := row.recording.missing())}
-    present = {name: row for name, row in rows.items() if name not in missing}
-    counts = {name: 1 + copies * bool(row.copies) for name, row in present.items()}
-    planned = [(name, seed) for name, count in counts.items() for seed in range(count)]
-    log = SessionLog("buildings", files, [(name, str(seed)) for name, seed in planned])
-    tasks = [(present[name].configuration(), present[name].copies, seed) for name, seed in planned]
-    results = zip(planned, run_tasks(_measure_run, tasks, workers=workers), strict=True)
-    found: dict[Section, list[RunFigures]] = {}
-    notes = []
+    every = buildings_rows()
+    sections: dict[str, BuildingsRow] = {row.section: row for row in every.values()}
+    names = select_rows(rows, {**sections, **every}, tuple(sections))
+    chosen = {name: row for name, row in every.items() if name in names or row.section in names}
+    missing = {name: reason for name, row in chosen.items() if (reason := row.recording.missing())}
+    present = {name: row for name, row in chosen.items() if name not in missing}
+    tasks = {
+        name: {
+            str(seed): (row.configuration(), row.copies, seed)
+            for seed in range(1 + copies * bool(row.copies))
+        }
+        for name, row in present.items()
+    }
+    log, notes = SessionLog("buildings", output, against, tasks), list[str]()
+    found: dict[Section, list[Measured]] = {}
     yield markdown_header(COLUMNS)
-    for name, row in present.items():
-        runs = []
-        for (_, seed), figures in islice(results, counts[name]):
-            accepted = figures.sequences[figures.sequences[:, 0].astype(bool), 1]
-            counts_of = {
-                "closures": len(figures.closures),
-                "false_closures": int(figures.closures.sum()),
-                "sequences": len(accepted),
-                "false_sequences": int(accepted.sum()),
-            }
-            log.add(name, seed, dict(zip(RunFigures._fields[:3], figures, strict=False)) | counts_of)
-            runs.append(figures)
+    for name, runs in measured_rows(_measure_run, tasks, workers, log):
+        row = present[name]
         yield markdown_row([row.recording.label, *_cells(runs)])
         found.setdefault(row.section, []).extend(runs)
         if row.section == "ids":
@@ -179,11 +155,14 @@ def buildings_table(
         notes.append(f"Create, {len(final)} settings: final median {median} m; above odometry: {above}.")
     notes += [f"Left out: {name}: {reason}" for name, reason in missing.items()]
     yield from ["", *notes] if notes else []
-    yield from compare_runs(COMPARED, log, list(rows))
+    yield from compare_runs(COMPARED, log, list(chosen))
 
 
-def _measure_run(task: tuple[RunConfig, str, int]) -> RunFigures:
+def _measure_run(task: tuple[RunConfig, str, int]) -> Measured:
     """Runs and measures a recording with a configuration, or its copy of a kind and a seed (0: as it is).
+
+    Closures and sequences without known truth do not count as false. Shown are the `calibration` of the odds:
+    [R, 2] log odds that each closure sequence is true, NaN where they are not known, and whether it is false.
 
     Raises:
         InputError: the recording cannot be used, or has no truth.
@@ -192,8 +171,17 @@ def _measure_run(task: tuple[RunConfig, str, int]) -> RunFigures:
     _, session, run = run_recording(config, _PERTURBATIONS[copies] if seed else None, seed)
     claims = closure_claims(session.map, run.truth)
     false, sequences, odds = judge_claims(claims)
-    odometry, final, live = (known_ate(path, run.truth) for path in (run.odometry, run.trajectory, run.live))
-    return RunFigures(odometry, final, live, false[claims.accepted], sequences, odds)
+    closures, accepted = false[claims.accepted], sequences[sequences[:, 0], 1]
+    figures = {
+        "odometry": known_ate(run.odometry, run.truth),
+        "final": known_ate(run.trajectory, run.truth),
+        "live": known_ate(run.live, run.truth),
+        "closures": len(closures),
+        "false_closures": int(closures.sum()),
+        "sequences": len(accepted),
+        "false_sequences": int(accepted.sum()),
+    }
+    return Measured(figures, {"calibration": np.column_stack([odds, sequences[:, 1]])})
 
 
 def judge_claims(claims: ClosureClaims) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -234,55 +222,51 @@ COMPARED = Compared(
 """Of two runs of the table; a run whose final map is worse than odometry is a failure."""
 
 
-def _cells(runs: Sequence[RunFigures]) -> list[str]:
+def _cells(runs: Sequence[Measured]) -> list[str]:
     """The cells of a row: its recording as it is, then the copies."""
     odometry, final, live = _errors(runs)
     ratio = (final / np.maximum(odometry, 1e-12)).max()
     return [
-        *map(metres, runs[0][:3]),
+        *map(metres, (odometry[0], final[0], live[0])),
         _spread(final[1:]),
         _spread(live[1:]),
         f"{ratio:.2f}",
         f"{_is_worse(final, odometry).sum()}, {_is_worse(live, odometry).sum()} of {len(runs)}",
-        _closures(runs[:1]),
-        _closures(runs),
-        _sequences(runs),
+        _false(runs[:1], "closures"),
+        _false(runs, "closures"),
+        _false(runs, "sequences"),
     ]
 
 
-def _total(runs: Sequence[RunFigures]) -> str:
+def _total(runs: Sequence[Measured]) -> str:
     """The line below the table over all runs of buildings."""
     odometry, final, live = _errors(runs)
-    closures = np.concatenate([run.closures for run in runs])
-    odds, sequences = np.concatenate([run.odds for run in runs]), np.vstack([run.sequences for run in runs])
+    odds, false = np.concatenate([run.shown["calibration"] for run in runs]).T
     known = np.isfinite(odds)
-    error = expected_calibration_error(expit(odds[known]), ~sequences[known, 1])
-    share = f" ({closures.mean():.1%})" if len(closures) else ""
+    error = expected_calibration_error(expit(odds[known]), false[known] == 0)
+    closures = column(runs, "closures").sum()
+    share = f" ({column(runs, 'false_closures').sum() / closures:.1%})" if closures else ""
     return (
-        f"All buildings, {len(runs)} runs: false / closures {_closures(runs)}{share}; false / sequences "
-        f"{_sequences(runs)}; worse than odometry: final {_is_worse(final, odometry).mean():.1%}, live "
-        f"{_is_worse(live, odometry).mean():.1%}; expected calibration error of the odds of {known.sum()} "
+        f"All buildings, {len(runs)} runs: false / closures {_false(runs, 'closures')}{share}; false / "
+        f"sequences {_false(runs, 'sequences')}; worse than odometry: final "
+        f"{_is_worse(final, odometry).mean():.1%}, live {_is_worse(live, odometry).mean():.1%}; expected "
+        f"calibration error of the odds of {known.sum()} "
         f"sequences {error:.3f}."
     )
 
 
-def _errors(runs: Sequence[RunFigures]) -> np.ndarray:
+def _errors(runs: Sequence[Measured]) -> np.ndarray:
     """[3, n] ATE of odometry, final and live, m."""
-    return np.array([run[:3] for run in runs]).T
+    return np.array([column(runs, name) for name in ("odometry", "final", "live")])
 
 
 def _spread(errors: np.ndarray) -> str:
     return f"{metres(np.median(errors))}, {metres(errors.max())}" if len(errors) else "-"
 
 
-def _closures(runs: Sequence[RunFigures]) -> str:
-    return f"{sum(run.closures.sum() for run in runs)} / {sum(len(run.closures) for run in runs)}"
-
-
-def _sequences(runs: Sequence[RunFigures]) -> str:
-    """False ones of the accepted sequences."""
-    accepted = np.concatenate([run.sequences[run.sequences[:, 0]] for run in runs])
-    return f"{accepted[:, 1].sum()} / {len(accepted)}"
+def _false(runs: Sequence[Measured], name: str) -> str:
+    """False ones of the accepted closures, or of the accepted sequences."""
+    return f"{column(runs, f'false_{name}').sum()} / {column(runs, name).sum()}"
 
 
 ROWS = {
@@ -306,19 +290,19 @@ ROWS = {
 }
 
 
-def laser_table(rows: Sequence[str] = tuple(ROWS), copies: int = 10, workers: int = 0) -> Iterator[str]:
+def laser_table(rows: Sequence[str] | None = None, copies: int = 10, workers: int = 0) -> Iterator[str]:
     """The lines of the table; rows whose recordings are missing are named below it."""
+    rows = select_rows(rows, ROWS)
     missing = {row: reason for row in rows if (reason := ROWS[row].missing())}
-    present = [row for row in rows if row not in missing]
-    tasks = []
-    for row in present:
-        tasks.append((ROWS[row].configuration("backend=classic"), 0))
-        tasks += [(ROWS[row].configuration(), seed) for seed in range(copies + 1)]
-    results = run_tasks(_measure_recording, tasks, workers=workers)
+    tasks = {
+        row: {"classic": (ROWS[row].configuration("backend=classic"), 0)}
+        | {str(seed): (ROWS[row].configuration(), seed) for seed in range(copies + 1)}
+        for row in rows
+        if row not in missing
+    }
     heads = ("classic (closures, false)", "ratslam (closures, false)", "perturbed: median, maximum")
     yield markdown_header(["recording", "odometry", *heads])
-    for row in present:
-        classic, ours, *perturbed_copies = (next(results) for _ in range(copies + 2))
+    for row, (classic, ours, *perturbed_copies) in measured_rows(_measure_recording, tasks, workers):
         spread = _spread(np.array([error for error, *_ in perturbed_copies]))
         cells = [f"{metres(error)} ({closures}, {false})" for error, _, closures, false in (classic, ours)]
         yield markdown_row([ROWS[row].label, metres(ours[1]), *cells, spread])

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import minimize
@@ -52,11 +52,11 @@ JudgedSession = tuple[np.ndarray, np.ndarray, np.ndarray, tuple[SequenceEvidence
 all, `YOUNG` and no keyframes have followed them."""
 
 
-def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = None) -> Iterator[str]:
+def closures_table(sessions: int = 6, workers: int = 0, output: Path | None = None) -> Iterator[str]:
     """The lines of the table, and the weights.
 
     Args:
-        sessions: of each row. folder: gets the weights as a file to ship; None: no file.
+        sessions: of each row. output: folder that gets the weights as a file to ship; None: no file.
     """
     sessions = max(sessions, FEW)
     tasks = [TouchTask(row, FIRST + number) for row in ROWS for number in range(sessions)]
@@ -70,9 +70,9 @@ def closures_table(sessions: int = 6, workers: int = 0, folder: Path | None = No
     weights = fit_weights(every)
     text = json.dumps({"weights": np.round(weights, 3).tolist()}, indent=1)
     yield f"\n```json\n{text}\n```"
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / WEIGHTS).write_text(text + "\n", encoding="utf-8")
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+        (output / WEIGHTS).write_text(text + "\n", encoding="utf-8")
 
 
 def _judge_session(task: TouchTask) -> JudgedSession:
@@ -104,23 +104,35 @@ def fit_weights(sessions: Sequence[JudgedSession]) -> np.ndarray:
     features = np.concatenate([evidence.features() for evidence, _ in versions])
     true = np.concatenate([true for _, true in versions]).astype(float)
     known = np.isfinite(features).all(axis=(1, 2))
-    return np.stack([_regress(features[known, way], true[known]) for way in (0, 1)])
-
-
-def _regress(features: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Weights of features [n, F], the first of which is 1, by which they tell what is true [n]."""
-    worth = 1 / 3  # a sequence counts once, however often it is judged
-    ridge = RIDGE * (np.arange(features.shape[1]) > 0)
-
-    def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
-        z = features @ weights
-        value = worth * (np.logaddexp(0, z) - true * z).sum() + (ridge * weights**2).sum() / 2
-        return float(value), worth * features.T @ (expit(z) - true) + ridge * weights
-
     against = np.zeros(2 * KINDS, bool)
     against[[0, 1, KINDS, KINDS + 1]] = True
     bounds = [(None, None), (0, None), (0, None), *((None, 0 if one else None) for one in against)]
+    # A sequence counts once, however often it is judged.
+    return np.stack([regress(features[known, way], true[known], RIDGE, 1 / 3, bounds) for way in (0, 1)])
+
+
+def regress(
+    features: np.ndarray, true: np.ndarray, ridge: float, worth: float = 1.0, bounds: Any = None
+) -> np.ndarray:
+    """Weights of features [n, F], the first of which is 1, by which they tell what is true [n] (logistic
+    regression).
+
+    Args:
+        ridge: penalty on the squared weights but the first. worth: of a row. bounds: of the weights.
+    """
+    ridges = ridge * (np.arange(features.shape[1]) > 0)
+
+    def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
+        z = features @ weights
+        value = worth * (np.logaddexp(0, z) - true * z).sum() + (ridges * weights**2).sum() / 2
+        return float(value), worth * features.T @ (expit(z) - true) + ridges * weights
+
     return cast(np.ndarray, minimize(loss, np.zeros(features.shape[1]), jac=True, bounds=bounds).x)
+
+
+def area(values: np.ndarray, true: np.ndarray) -> str:
+    """AUC of values [n] by which they tell what is true [n] bool; `-` if all or nothing is."""
+    return f"{auc(values[~true], values[true]):.3f}" if true.any() and not true.all() else "-"
 
 
 def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[np.ndarray]) -> str:
@@ -131,8 +143,5 @@ def _line(name: str, sessions: Sequence[JudgedSession], fitted: Sequence[np.ndar
         for k in (0, 2)
     )
     known = np.isfinite(odds)
-    cells, true = [], true[known]
-    for values in (score, accepted.astype(float), odds, ended):
-        both = true.any() and not true.all()
-        cells.append(f"{auc(values[known][~true], values[known][true]):.3f}" if both else "-")
-    return markdown_row([name, len(sessions), int(known.sum()), int(true.sum()), *cells])
+    areas = (area(values[known], true[known]) for values in (score, accepted.astype(float), odds, ended))
+    return markdown_row([name, len(sessions), int(known.sum()), int(true[known].sum()), *areas])

@@ -24,18 +24,18 @@ Example:
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.studies.executor import run_tasks
 from evaluation.studies.machine import code_digest
+from evaluation.studies.study_report import csv_text
 from tactile.base.bounded import read_rows
 from tactile.base.errors import InputError
 from tactile.base.files import write_text_atomically
@@ -47,13 +47,53 @@ Record = Mapping[str, Figure]
 """The figures of a session by name."""
 Key = tuple[str, str]
 """Row and session."""
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 
 
-Files = tuple[Path | None, Path | None]
-"""Folders of a run: where its sessions are written, and of the earlier run that it is compared with."""
+class Measured(NamedTuple):
+    """What is measured of one session.
+
+    Attributes:
+        record: its figures by name, of which `True` is a failure. shown: what its table and its picture show
+            besides, by name.
+    """
+
+    record: Record
+    shown: Mapping[str, Any]
+
+
+def column(found: Sequence[Measured], name: str) -> np.ndarray:
+    """[n] a figure of all sessions, recorded or shown."""
+    return np.array([one.record[name] if name in one.record else one.shown[name] for one in found])
+
+
 Sessions = dict[Key, tuple[str, Record]]
 """The rows of a file: what measured a session, which is the digest of the code and the settings beside row
 and session on which the figures depend; and its figures."""
+
+
+def measured_rows(
+    measure: Callable[[Task], Result],
+    rows: Mapping[str, Mapping[str, Task]],
+    workers: int,
+    log: SessionLog | None = None,
+) -> Iterator[tuple[str, list[Result]]]:
+    """Each row with the results of its sessions, as soon as all of them are measured.
+
+    Args:
+        measure: a session from its task; a `Measured` with a log. rows: the tasks by row and session.
+            workers: processes. log: gets each session as soon as it is measured.
+    """
+    tasks = [task for sessions in rows.values() for task in sessions.values()]
+    results = run_tasks(measure, tasks, workers=workers)
+    for row, sessions in rows.items():
+        found = []
+        for session in sessions:
+            found.append(next(results))
+            if log is not None:
+                log.add(row, session, cast(Measured, found[-1]).record)
+        yield row, found
 
 
 class SessionLog:
@@ -63,8 +103,9 @@ class SessionLog:
     measured it.
 
     Args:
-        name: of the table; its file is `NAME.csv`. planned: the sessions that will be measured. settings: see
-            `Sessions`.
+        name: of the table; its file is `NAME.csv`. output: folder of the file; None: none is written.
+            against: folder of the earlier run to compare with, if any. rows: the sessions that will be
+            measured, by row. settings: see `Sessions`.
 
     Attributes:
         measured: the sessions added so far. earlier: those of the run to compare with; None without one.
@@ -73,8 +114,15 @@ class SessionLog:
         InputError: a file of the run cannot be used.
     """
 
-    def __init__(self, name: str, files: Files, planned: Iterable[Key], settings: str = "") -> None:
-        output, against = files
+    def __init__(
+        self,
+        name: str,
+        output: Path | None,
+        against: Path | None,
+        rows: Mapping[str, Iterable[str]],
+        settings: str = "",
+    ) -> None:
+        planned = [(row, session) for row, sessions in rows.items() for session in sessions]
         self.measured: Sessions = {}
         self.earlier = None if against is None else _earlier_sessions(against, f"{name}.csv", planned)
         if output is not None and against is not None and output.resolve() == against.resolve():
@@ -86,12 +134,12 @@ class SessionLog:
         if self._path is not None and self._path.exists():
             self._kept = read_sessions(self._path)
 
-    def add(self, row: str, session: object, figures: Mapping[str, Any]) -> None:
+    def add(self, row: str, session: str, figures: Mapping[str, Any]) -> None:
         """Adds a session, and writes the file."""
         plain = {
             name: value.item() if isinstance(value, np.generic) else value for name, value in figures.items()
         }
-        self.measured[row, str(session)] = self._code, plain
+        self.measured[row, session] = self._code, plain
         if self._path is not None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_text_atomically(self._path, sessions_text({**self._kept, **self.measured}))
@@ -99,14 +147,11 @@ class SessionLog:
 
 def sessions_text(sessions: Sessions) -> str:
     """The text of a file; a cell is empty where a session has no such figure, or NaN."""
-    names = dict.fromkeys(chain.from_iterable(figures for _, figures in sessions.values()))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [*KEY, *names], lineterminator="\n")
-    writer.writeheader()
-    for (row, session), (code, figures) in sessions.items():
-        known = {name: repr(value) for name, value in figures.items() if value == value}
-        writer.writerow({"row": row, "session": session, "code": code} | known)
-    return text.getvalue()
+    return csv_text([
+        dict(zip(KEY, (*key, code), strict=True))
+        | {name: repr(value) if value == value else "" for name, value in figures.items()}
+        for key, (code, figures) in sessions.items()
+    ])  # fmt: skip
 
 
 def read_sessions(path: Path) -> Sessions:
@@ -137,23 +182,23 @@ def read_sessions(path: Path) -> Sessions:
     return dict(read_rows(path, "a file of sessions, as -o writes it", parse))
 
 
-def _earlier_sessions(folder: Path, name: str, planned: Iterable[Key]) -> Sessions:
+def _earlier_sessions(folder: Path, name: str, planned: list[Key]) -> Sessions:
     """The sessions of an earlier run, of which some are planned now."""
     cure = "name the folder that the earlier run was given by -o"
     if not (folder / name).is_file():
         found = f"no {name} in it" if folder.is_dir() else "no such folder"
         raise InputError(str(folder), found, f"a folder with the {name} of an earlier run", cure)
     sessions = read_sessions(folder / name)
-    wanted = list(planned)
-    if wanted and sessions.keys().isdisjoint(wanted):
-        found = f"none of the {len(wanted)} sessions to be measured ({_some(wanted)}), but {_some(sessions)}"
+    if planned and sessions.keys().isdisjoint(planned):
+        wanted, there = (some_of(" ".join(key) for key in keys) for keys in (planned, sessions))
+        found = f"none of the {len(planned)} sessions to be measured ({wanted}), but {there}"
         raise InputError(str(folder / name), found, "a run of the same rows and sessions", cure)
     return sessions
 
 
-def _some(keys: Iterable[Key]) -> str:
+def some_of(sessions: Iterable[str]) -> str:
     """The first and the last of some sessions."""
-    names = [" ".join(key) for key in keys]
+    names = list(sessions)
     return ", ".join(names if len(names) < 3 else (names[0], "...", names[-1])) or "no session"
 
 

@@ -21,12 +21,12 @@ from unittest.mock import patch
 import numpy as np
 
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
+from evaluation.papers.trial_sessions import collect_session
 from ratslam.core.compilation import Precision, prepare_precision
 from ratslam.core.session import Session
 from ratslam.mapping import keyframe_merger, selection_worker
-from ratslam.runs.build_session import build_session, open_observations
+from ratslam.runs.build_session import build_session
 from ratslam.runs.settings.run_config import RunConfig, load_config
-from robot.sources.in_memory import load_into_memory
 from robot.touch_source import observation_of
 from tactile.base.types import Observation
 
@@ -99,22 +99,26 @@ class _Cycle(NamedTuple):
         return 1e6 * float(np.median(own)), percentile, 1e3 * float(own.max()), 1e3 * float(clock.max())
 
 
-def cycle_table(sessions: Sequence[str] | None = None, rounds: int = 5) -> Iterator[str]:
+def cycle_table(rows: Sequence[str] | None = None, rounds: int = 5, profile: bool = False) -> Iterator[str]:
     """The lines of the table, after all rounds.
 
     Args:
-        sessions: of `SESSIONS`; None: all. rounds: repeats, of which the median is taken.
+        rows: of `SESSIONS`; None: all. rounds: repeats, of which the median is taken. profile: whether the
+            table is that of `profile_table` instead.
 
     Raises:
         InputError: a recording cannot be read.
     """
-    cycles = _open_cycles(sessions, ("float64", "float32"))
-    rows = np.array([[(cycle.time(), *cycle.time_live()) for cycle in cycles] for _ in range(rounds)])
+    if profile:
+        yield from profile_table(rows)
+        return
+    cycles = _open_cycles(rows, ("float64", "float32"))
+    times = np.array([[(cycle.time(), *cycle.time_live()) for cycle in cycles] for _ in range(rounds)])
     yield markdown_header(COLUMNS)
-    for cycle, found in zip(cycles, np.median(rows, axis=0).tolist(), strict=True):
+    for cycle, found in zip(cycles, np.median(times, axis=0).tolist(), strict=True):
         us, median, percentile, slowest, clock = found
-        times = f"{us:.0f}", f"{median:.0f}", f"{percentile:.0f}", f"{slowest:.1f}", f"{clock:.1f}"
-        yield markdown_row([cycle.name, cycle.backend, cycle.precision, len(cycle.observations), *times])
+        cells = f"{us:.0f}", f"{median:.0f}", f"{percentile:.0f}", f"{slowest:.1f}", f"{clock:.1f}"
+        yield markdown_row([cycle.name, cycle.backend, cycle.precision, len(cycle.observations), *cells])
 
 
 def profile_table(sessions: Sequence[str] | None = None) -> Iterator[str]:
@@ -145,8 +149,7 @@ def _open_cycles(sessions: Sequence[str] | None, precisions: Sequence[Precision]
     for name, backend, precision in product(names, BACKENDS, precisions):
         settings = [f"backend={backend}", f"session.precision={precision}"]
         config: RunConfig = load_config(SESSIONS[name], settings)
-        with open_observations(config) as (config, source):
-            log = load_into_memory(source)
+        config, log = collect_session(config, every=False)
         observations = [observation_of(sample) for sample in log]
         cycles.append(_Cycle(name, backend, precision, build_session(config, log), observations))
     for cycle in cycles:

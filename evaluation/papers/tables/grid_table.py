@@ -14,9 +14,9 @@ import numpy as np
 from evaluation.metrics.occupancy_grid import OccupancyGrid
 from evaluation.metrics.occupancy_score import score_grid
 from evaluation.metrics.trajectory import position_error
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.comparison import measured_rows
+from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
 from evaluation.papers.trial_sessions import session_at_start
-from evaluation.studies.executor import run_tasks
 from ratslam.core.compilation import prepare_precision
 from ratslam.runs.build_session import open_source, read_observations
 from ratslam.runs.run_directory import true_grid
@@ -48,7 +48,6 @@ ODOMETRY_ERRORS = {
     "measured": "as of real Creates",
     "measured, calibrated": "as of real Creates, mean scales corrected",
 }
-_NO_WALLS, _GEOMETRIC = ({"touch": {"reports": {"walls": walls}}} for walls in ("none", "geometric"))
 _WIDE_DRIFT = {"grid": {"drift": {"heading_rate": 2e-3, "move": 0.08}}}
 """A heading drift of 0.12 rad/min, the RMS of real Creates, and larger errors of single moves."""
 ROWS: dict[str, dict[str, Any]] = {
@@ -57,24 +56,13 @@ ROWS: dict[str, dict[str, Any]] = {
     "white": {},
     "measured": {},
     "measured, calibrated": {},
-    "measured, blobs only": _NO_WALLS,
     "measured, wide drift": _WIDE_DRIFT,
-    "measured, calibrated, wide drift": _WIDE_DRIFT,
     "bias, wide drift": _WIDE_DRIFT,
     "move, wide drift": _WIDE_DRIFT,
-    "bias, blobs only": _NO_WALLS,
-    "move, blobs only": _NO_WALLS,
-    "bias, geometric": _GEOMETRIC,
-    "move, geometric": _GEOMETRIC,
+    "bias, blobs only": {"touch": {"reports": {"walls": "none"}}},
+    "bias, geometric": {"touch": {"reports": {"walls": "geometric"}}},
     "bias, as printed": {"grid": AS_PRINTED},
     "move, as printed": {"grid": AS_PRINTED},
-    "bias without run errors": {"grid": {"drift": {"session": 0.0}}},
-    "move, temper 1, prior 0.3": {"grid": {"likelihood": {"free": 1.0, "unexplored": 0.3}}},
-    "bias, BACK skipped": {},
-    "move, BACK skipped": {},
-    "bias, 1000 particles": {"grid": {"particles": 1000}},
-    "move, 1000 particles": {"grid": {"particles": 1000}},
-    "move, no compass": {"grid": {"likelihood": {"wall_direction_prior": False}}},
 }
 """Settings; the name begins with the model of the odometry errors."""
 DEFAULT_ROWS = (
@@ -98,19 +86,31 @@ skill of free space alone, Chamfer map to walls and walls to map, m."""
 
 
 def grid_table(
-    rows: Sequence[tuple[str, str]] = DEFAULT_ROWS, arenas: int = 10, first: int = 9000, workers: int = 0
+    rows: Sequence[str] | None = None,
+    worlds: Sequence[str] | None = None,
+    arenas: int = 10,
+    first: int = 9000,
+    workers: int = 0,
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its sessions are done.
 
     Args:
-        rows: pairs of a world and a row. first: seed of the first arena.
+        rows, worlds: each row in each world; without both `DEFAULT_ROWS`. first: seed of the first arena.
+
+    Raises:
+        InputError: no such row.
     """
-    tasks = [(*row, arena) for row in rows for arena in range(first, first + arenas)]
-    results = run_tasks(measure_session, tasks, workers=workers)
+    names = select_rows(rows, ROWS, tuple(ODOMETRY_ERRORS))
+    places = [(world, row) for world in worlds or "AB" for row in names] if rows or worlds else DEFAULT_ROWS
+    tasks = {
+        f"{world}, {ODOMETRY_ERRORS.get(row, row)}": {
+            str(arena): (world, row, arena) for arena in range(first, first + arenas)
+        }
+        for world, row in places
+    }
     yield markdown_header(COLUMNS)
-    for world, row in rows:
-        found = [next(results) for _ in range(arenas)]
-        yield markdown_row([f"{world}, {ODOMETRY_ERRORS.get(row, row)}", *_cells(found)])
+    for row, found in measured_rows(measure_session, tasks, workers):
+        yield markdown_row([row, *_cells(found)])
 
 
 def task_config(world: str, row: str, arena: int) -> RunConfig:
@@ -137,11 +137,6 @@ def measure_session(task: tuple[str, str, int]) -> GridFigures:
     if "calibrated" in row:
         observations = correct_observations(MEAN_ERRORS, observations)
     moves = np.array([observation.odometry[:3] for observation in observations])
-    if "BACK skipped" in row:
-        still = observations[0].odometry._replace(dx=0.0, dy=0.0, dtheta=0.0, dt=0.5)
-        observations = [
-            o._replace(odometry=still) if o.motion == MotionKind.BACK else o for o in observations
-        ]
     touch = report_config_of(source.info, config.touch.reports)
     session = session_at_start(grid, touch.mounts, touch.length, "float32", config.session.seed)
     online = np.array([step.pose for step in session.replay(observations)])

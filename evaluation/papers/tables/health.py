@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.special import expit
 
 from evaluation.metrics.energy_metric import energy_all_pairs
-from evaluation.metrics.statistics import auc
 from evaluation.papers.tables.buildings import HARM_FACTOR, HARM_MARGIN
+from evaluation.papers.tables.closures import area, regress
 from evaluation.papers.tables.markdown import markdown_header, markdown_row
 from evaluation.papers.tables.recordings import real_recordings
 from evaluation.papers.tables.spoilt_maps import spoilt_maps
@@ -127,12 +126,7 @@ def fit_weights(maps: np.ndarray) -> np.ndarray:
     mean, sd = features.mean(axis=0), features.std(axis=0) + 1e-9
     columns = np.column_stack([np.ones(len(bad)), (features - mean) / sd])
 
-    def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
-        z, ridge = columns @ weights, RIDGE * weights * (np.arange(len(weights)) > 0)
-        value = np.logaddexp(0, z).sum() - z[bad].sum() + ridge @ weights / 2
-        return float(value), columns.T @ (expit(z) - bad) + ridge
-
-    weights = minimize(loss, np.zeros(columns.shape[1]), jac=True).x
+    weights = regress(columns, bad, RIDGE)
     scaled = weights[1:] / sd
     return np.array([weights[0] - scaled @ mean, *scaled])
 
@@ -143,10 +137,6 @@ def _line(name: str, sessions: Sequence[np.ndarray], weights: np.ndarray) -> str
     ratio, bad = maps[:, RATIO], maps[:, BAD] > 0
     worse = expit(weights[0] + maps[:, :RATIO] @ weights[1:])
     clear, doubted = (ratio > CLEAR) | (ratio < 1 / CLEAR), worse > DOUBTED
-    areas = _auc(worse, bad), _auc(worse[clear], bad[clear]), _auc(-maps[:, CLOSURES], bad)
+    areas = area(worse, bad), area(worse[clear], bad[clear]), area(-maps[:, CLOSURES], bad)
     shares = (f"{happened.sum()} of {len(happened)}" for happened in (doubted[~bad], ~doubted[bad]))
     return markdown_row([name, len(bad), int(bad.sum()), *areas, *shares])
-
-
-def _auc(values: np.ndarray, bad: np.ndarray) -> str:
-    return f"{auc(values[~bad], values[bad]):.3f}" if bad.any() and not bad.all() else "-"

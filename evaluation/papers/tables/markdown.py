@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
+
+from evaluation.metrics.statistics import wilson_interval
 from tactile.base.errors import InputError
 
 
@@ -23,6 +26,15 @@ def table_lines(
     """The lines of a table, with sentences above and below it."""
     table = [*markdown_header(columns).splitlines(), *map(markdown_row, rows)]
     return [*above, *[""] * bool(above), *table, *[""] * bool(below), *below]
+
+
+def count(happened: Sequence[bool] | np.ndarray) -> str:
+    """How many of the sessions [n] bool, with the 95 % interval of the rate in percent."""
+    number, total = int(np.sum(happened)), len(happened)
+    if not total:
+        return "-"
+    low, high = wilson_interval(number, total)
+    return f"{number} of {total} [{100 * low:.0f}-{100 * high:.0f} %]"
 
 
 def select_rows(

@@ -35,11 +35,11 @@ MOTION = 0.2, 0.1
 COLUMNS = ("cells a side", "ratslam", "float32", "whole torus", "NumPy", "NumPy / ratslam")
 
 
-def speed_table(sizes: Sequence[int] = SIZES, rounds: int = ROUNDS) -> Iterator[str]:
-    """The lines of the table, each as soon as it is timed."""
+def speed_table(rows: Sequence[int] | None = None, rounds: int = ROUNDS) -> Iterator[str]:
+    """The lines of the table, each as soon as it is timed; rows: of `SIZES`, or others."""
     prepare_precision("float64")
     yield markdown_header(COLUMNS)
-    for n in sizes:
+    for n in rows or SIZES:
         us = interleaved_medians(network_calls(n), rounds)
         times = (f"{us[name]:.0f} us" for name in ("window", "window, float32", "dense", "numpy"))
         yield markdown_row([n, *times, f"{us['numpy'] / us['window']:.0f}"])

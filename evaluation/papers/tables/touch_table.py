@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,16 +17,20 @@ import numpy as np
 from evaluation.metrics.energy_metric import energy_all_pairs
 from evaluation.metrics.exm import ExmConfig
 from evaluation.metrics.run_metrics import energy_within_pieces, unjoined_share
-from evaluation.metrics.statistics import wilson_interval
-from evaluation.papers.tables.comparison import Compared, Files, SessionLog, compare_runs
-from evaluation.papers.tables.markdown import markdown_header, markdown_row
+from evaluation.papers.tables.comparison import (
+    Compared,
+    Measured,
+    SessionLog,
+    column,
+    compare_runs,
+    measured_rows,
+)
+from evaluation.papers.tables.markdown import count, markdown_header, markdown_row, select_rows
 from evaluation.papers.trial_sessions import run_session, start_session
-from evaluation.studies.executor import run_tasks
 from evaluation.studies.growth import with_new_ground
 from evaluation.studies.metrics import (
     FALSE_CLOSURE_DISTANCE,
     SessionResult,
-    TouchMetrics,
     closure_errors,
     experience_metric_if_defined,
     touch_metrics,
@@ -49,14 +53,11 @@ _RECOVERY_LIMIT = 45
 
 MAIN: dict[str, Any] = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}}}
 _ROUGH = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
-_MAX_ANGLE = {"image": {"transform": "max_angle"}}
-KIDNAPS, _KIDNAPS_24 = ({"kidnaps": {"count": count, "ahead": 45.0}} for count in (8, 24))
-_CARRIED = {"may_be_carried": True}
-EXPLORATION, _LONG = {"path": {"explore": 1500}}, MAIN | {"path": {"explore": 5000}}
+KIDNAPS = {"kidnaps": {"count": 8, "ahead": 45.0}}
+EXPLORATION = {"path": {"explore": 1500}}
 _OPEN_ARENA, _TREE = (MAIN | EXPLORATION | {"maze": maze} for maze in ({"share": 0.08}, {"kind": "tree"}))
 NOISE = OdometryConfig()
 _NOISE_X_2 = {"length": 2 * NOISE.length, "heading": 2 * NOISE.heading}
-_OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
 class TouchRow(NamedTuple):
@@ -85,16 +86,11 @@ ROWS = {
     "rough, 3 % faults": TouchRow(
         "rough, 3 % contacts missed, 3 % spurious", _ROUGH | {"mechanics": {"missed": 0.03, "spurious": 0.03}}
     ),
-    "open, max_angle": TouchRow("open loop, max_angle", _OPEN_LOOP, _MAX_ANGLE),
     "white": TouchRow("white odometry noise", {"odometry": {"noise": "white"}}, sessions=20),
-    "telescoping": TouchRow("telescoping noise", {"odometry": {"noise": "telescoping"}}),
     "exploration": TouchRow("free exploration, 1500 whisks", EXPLORATION, sessions=40),
     "open arena": TouchRow("open arena, 8 % of the walls, free exploration", _OPEN_ARENA, sessions=20),
     "tree": TouchRow("maze without loops, free exploration", _TREE, sessions=20),
     "noise x 2": TouchRow("odometry noise x 2", MAIN | {"odometry": _NOISE_X_2}, sessions=20),
-    "exploration, 3000": TouchRow("free exploration, 3000 whisks", {"path": {"explore": 3000}}),
-    "exploration, 5000": TouchRow("free exploration, 5000 whisks", _LONG, sessions=5),
-    "kidnaps, 5000": TouchRow("5000 whisks with 24 kidnaps", _LONG | _KIDNAPS_24, {}, _CARRIED, sessions=5),
     "new ground": TouchRow("3000 whisks that enter no cell twice", MAIN, sessions=5, new_ground=3000),
     "5 x 5": TouchRow("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
     "12 x 8": TouchRow("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
@@ -104,9 +100,6 @@ ROWS = {
     "radii - 20 %": TouchRow("base radii - 20 %", {}, {"head": _head(0.036, 0.052, 0.064)}),
     "rest 90": TouchRow("rest angle + 20 %", {}, {"head": {"rest_deg": 90.0}}),
     "rest 60": TouchRow("rest angle - 20 %", {}, {"head": {"rest_deg": 60.0}}),
-    "radial channel": TouchRow("with the radial channel", {}, {"image": {"radial": True}}),
-    "2 Hz": TouchRow("2 Hz whisking", {"whisking": {"rate": 2.0}}),
-    "RCP, max_angle": TouchRow("RCP, max_angle", {}, _MAX_ANGLE),
     "1 dead": TouchRow("1 dead whisker", {}, {"head": {"dead": [10]}}),
     "6 dead": TouchRow("6 dead whiskers", {}, {"head": {"dead": [1, 6, 7, 10, 14, 17]}}),
     "noise 1e-3": TouchRow("sensor noise 1e-3 rad", {"mechanics": {"noise": 1e-3}}),
@@ -116,19 +109,11 @@ ROWS = {
         "main from raw samples with drift, colour and creep",
         MAIN | {"mechanics": {"baseline": HALL_BASELINE.model_dump()}},
     ),
-    "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, _CARRIED),
+    "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, {"may_be_carried": True}),
     "control: shuffled": TouchRow("control: shuffled images", MAIN),
     "control: no image": TouchRow("control: no images", MAIN),
     "control: other maze": TouchRow("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),
-    "open, contact_angle": TouchRow("open loop, contact_angle", _OPEN_LOOP),
-    "noise 5e-3": TouchRow("sensor noise 5e-3 rad", {"mechanics": {"noise": 5e-3}}),
-    "soft servo, open, max": TouchRow(
-        "soft servo, open loop, max_angle", _OPEN_LOOP | {"mechanics": {"servo": 0.3}}, _MAX_ANGLE
-    ),
-    "soft servo, RCP, max": TouchRow("soft servo, RCP, max_angle", {"mechanics": {"servo": 0.3}}, _MAX_ANGLE),
 }
-DEFAULT_ROWS = tuple(ROWS)[:-4]
-"""The rows printed if none are chosen."""
 COMPARED = Compared(
     "EM", "em", "em_live", "em_odometry",
     worse=lambda error, odometry: error > TOLERANCE * odometry,
@@ -156,78 +141,60 @@ class TouchTask(NamedTuple):
         return self.maze % 100
 
 
-class SessionFigures(NamedTuple):
-    """The figures of one session.
-
-    Attributes:
-        metrics: of `touch_metrics`, but `em_experiences` with steps without an experience at their own pose,
-            and `arcr_chain_free` 0 without re-localisations. revisits_closed: share of the revisits with a
-            true closure; NaN without revisits. em_live: EM of the poses given at each step. em_pieces: EM
-            over pairs of steps in the same piece of the map. unjoined: share of the steps outside its largest
-            piece. across: closures between the parts before and after `CHANGE`.
-            recovery: whisks from each kidnap to the first true closure.
-    """
-
-    metrics: TouchMetrics
-    revisits_closed: float
-    em_live: float
-    em_pieces: float
-    unjoined: float
-    across: int
-    recovery: tuple[int, ...]
-
-
 def touch_table(
-    rows: Sequence[str],
+    rows: Sequence[str] | None,
     first: int = FIRST_MAZE,
     sessions: int | None = None,
     workers: int = 0,
     backend: str = "recall",
-    files: Files = (None, None),
+    output: Path | None = None,
+    against: Path | None = None,
 ) -> Iterator[str]:
     """The lines of the table, each as soon as its sessions are done.
 
     Args:
-        first: number of the first maze; each session has the next one. sessions: of each row; None: the row's
-            own number. files: of the sessions, `touch.csv`, and of those to compare them with below the
-            table.
+        rows: None: all. first: number of the first maze; each session has the next one. sessions:
+            of each row; None: the row's own number. output, against: see `SessionLog`; the file is
+            `touch.csv`.
 
     Raises:
-        InputError: one of these files cannot be used.
+        InputError: no such row, or a file cannot be used.
     """
-    counts = {row: sessions or ROWS[row].sessions for row in rows}
-    tasks = [TouchTask(row, first + k, backend) for row in rows for k in range(counts[row])]
-    log = SessionLog("touch", files, [(task.row, str(task.maze)) for task in tasks], backend)
-    results = zip(tasks, run_tasks(_measure_session, tasks, workers=workers), strict=True)
-    notes: list[str] = []
+    rows = select_rows(rows, ROWS)
+    tasks = {
+        row: {str(maze): TouchTask(row, maze, backend) for maze in range(first, first + number)}
+        for row, number in ((row, sessions or ROWS[row].sessions) for row in rows)
+    }
+    log, notes = SessionLog("touch", output, against, tasks, backend), list[str]()
     yield markdown_header(COLUMNS)
-    for row in rows:
-        found = []
-        for task, figures in islice(results, counts[row]):
-            record = figures.metrics._asdict() | figures._asdict()
-            del record["metrics"]
-            whisks = record.pop("recovery")  # of which the number of kidnaps and the median are kept
-            recovery = np.median(whisks) if whisks else np.nan
-            log.add(row, task.maze, record | {"kidnaps": len(whisks), "recovery": recovery})
-            found.append(figures)
+    for row, found in measured_rows(_measure_session, tasks, workers, log):
         yield markdown_row([ROWS[row].label, *_cells(found)])
         notes += _notes(row, found)
     yield from ["", *notes] if notes else []
     yield from compare_runs(COMPARED, log, rows)
 
 
-def _measure_session(task: TouchTask) -> SessionFigures:
+def _measure_session(task: TouchTask) -> Measured:
     """Runs and measures one session."""
     return run_and_measure(task)[1]
 
 
 def run_and_measure(
     task: TouchTask, start: Callable[[RunConfig, InMemorySource], Session] = start_session
-) -> tuple[SessionResult, SessionFigures]:
+) -> tuple[SessionResult, Measured]:
     """Runs one session, and measures it.
 
     Args:
         start: makes the session from the completed configuration and its source.
+
+    Returns:
+        The result, and its figures: those of `TouchMetrics`, but `em_experiences` with steps without an
+        experience at their own pose, and `arcr_chain_free` 0 without re-localisations. revisits_closed: share
+        of the revisits with a true closure; NaN without revisits. em_live: EM of the poses given at each
+        step. em_pieces: EM over pairs of steps in the same piece of the map. unjoined: share of the steps
+        outside its largest piece. across: closures between the parts before and after `CHANGE`. kidnaps:
+        their number. recovery: whisks from a kidnap to the first true closure, median. Shown are the `whisks`
+        of each.
     """
     with open_observations(task_config(task)) as (config, source):
         kidnaps = np.flatnonzero(source.source.kidnapped).tolist()  # type: ignore[attr-defined]
@@ -247,14 +214,19 @@ def run_and_measure(
     change = int(CHANGE * log.length)
     across = (result.closures[:, 0] >= change) & (result.closures[:, 1] < change)
     later, earlier = true_closures.T
-    recovered = (min(later[(later >= k) & (earlier < k)] - k, default=log.length) for k in kidnaps)
-    em_experiences, em_live = (energy_all_pairs(path, truth).total for path in (snapped, result.live))
-    chain_free = float(np.nan_to_num(metrics.arcr_chain_free))
-    metrics = metrics._replace(em_experiences=em_experiences, arcr_chain_free=chain_free)
-    closed = _share_of_revisits_closed(truth, true_closures)
-    em_pieces = energy_within_pieces(result.trajectory, truth, result.piece).total
-    rest = unjoined_share(result.piece), int(across.sum()), tuple(map(int, recovered))
-    return result, SessionFigures(metrics, closed, em_live, em_pieces, *rest)
+    whisks = [int(min(later[(later >= k) & (earlier < k)] - k, default=log.length)) for k in kidnaps]
+    figures = metrics._asdict() | {
+        "em_experiences": energy_all_pairs(snapped, truth).total,
+        "arcr_chain_free": float(np.nan_to_num(metrics.arcr_chain_free)),
+        "revisits_closed": _share_of_revisits_closed(truth, true_closures),
+        "em_live": energy_all_pairs(result.live, truth).total,
+        "em_pieces": energy_within_pieces(result.trajectory, truth, result.piece).total,
+        "unjoined": unjoined_share(result.piece),
+        "across": int(across.sum()),
+        "kidnaps": len(whisks),
+        "recovery": _median(whisks),
+    }
+    return result, Measured(figures, {"whisks": whisks})
 
 
 def task_config(task: TouchTask) -> RunConfig:
@@ -287,51 +259,47 @@ def _share_of_revisits_closed(truth: np.ndarray, true_closures: np.ndarray) -> f
     return float(closed[revisits].mean()) if revisits else np.nan
 
 
-def _cells(found: Sequence[SessionFigures]) -> list[str]:
-    values = {name: [getattr(one.metrics, name) for one in found] for name in TouchMetrics._fields}
-    values |= {name: [getattr(one, name) for one in found] for name in ("revisits_closed", "em_live")}
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    """Median of the known values; NaN without one."""
+    return float(np.nanmedian(values)) if np.isfinite(values).any() else np.nan
 
+
+def _cells(found: Sequence[Measured]) -> list[str]:
     def median(name: str, digits: int = 3) -> str:
-        known = np.isfinite(values[name]).any()
-        return f"{np.nanmedian(values[name]):.{digits}f}" if known else "-"
+        middle = _median(column(found, name))
+        return "-" if np.isnan(middle) else f"{middle:.{digits}f}"
 
-    em, strict = np.array(values["em"]), np.array(values["arcr"])
-    ratio = em / np.array(values["em_odometry"])
+    em, odometry, strict = (column(found, name) for name in ("em", "em_odometry", "arcr"))
+    ratio = em / odometry
     worst = np.nanmin(strict) if np.isfinite(strict).any() else np.nan
     return [
         f"{np.median(em):.3f} ({em.max():.2f})",
         median("em_live"),
         median("em_odometry", 2),
-        _rate(em >= _SUCCESS),
-        f"{_rate(ratio > TOLERANCE)} ({ratio.max():.2f})",
+        count(em >= _SUCCESS),
+        f"{count(ratio > TOLERANCE)} ({ratio.max():.2f})",
         median("em_experiences"),
         median("arr"),
         f"{median('arcr')} ({worst:.2f}), {median('arcr_chain_free')}" if np.isfinite(worst) else "-",
         median("revisits_closed", 2),
-        f"{sum(values['false_closures'])} / {sum(values['closures'])}",
+        f"{column(found, 'false_closures').sum()} / {column(found, 'closures').sum()}",
     ]
 
 
-def _rate(happened: np.ndarray) -> str:
-    """How many of the sessions [n] bool, with the interval of the rate in percent."""
-    low, high = wilson_interval(int(happened.sum()), len(happened))
-    return f"{happened.sum()} of {len(happened)} [{100 * low:.0f}-{100 * high:.0f} %]"
-
-
-def _notes(row: str, found: Sequence[SessionFigures]) -> list[str]:
+def _notes(row: str, found: Sequence[Measured]) -> list[str]:
     """Lines below the table for some rows: closures across a change of mazes; recovery and the error within
     pieces after kidnaps."""
     notes = []
     if row == "control: other maze":
-        across, closures = sum(one.across for one in found), sum(one.metrics.closures for one in found)
+        across, closures = (column(found, name).sum() for name in ("across", "closures"))
         notes.append(f"{row}: {across} of {closures} closures join the parts before and after the change.")
-    recovery = np.array([whisks for figures in found for whisks in figures.recovery])
+    recovery = np.array([whisks for one in found for whisks in one.shown["whisks"]])
     if len(recovery):
         notes.append(
             f"{row}: whisks to the first true closure, median {np.median(recovery):.0f}; "
             f"within {_RECOVERY_LIMIT}: {(recovery <= _RECOVERY_LIMIT).mean():.0%}."
         )
-        em, unjoined = np.array([(one.em_pieces, one.unjoined) for one in found]).T
+        em, unjoined = column(found, "em_pieces"), column(found, "unjoined")
         notes.append(
             f"{row}: EM within pieces of the map, median {np.nanmedian(em):.3f} ({np.nanmax(em):.2f}); "
             f"share of steps outside the largest piece, median {np.median(unjoined):.0%} "

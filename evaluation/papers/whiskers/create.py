@@ -19,7 +19,6 @@ from evaluation.papers.tables.buildings import buildings_rows
 from evaluation.papers.tables.markdown import table_lines
 from evaluation.papers.tables.recordings import metres, require_recordings
 from evaluation.papers.trial_sessions import closure_claims, known_ate, run_recording
-from evaluation.papers.whiskers.bumps import wall_distances
 from evaluation.plots.style import BLUE, GREY, INK, VERMILLION, add_axes, name_axes, new_figure
 from evaluation.studies.metrics import SessionResult
 from ratslam.core.backend import Map
@@ -29,14 +28,11 @@ from ratslam.mapping.map_solution import DOUBTED, cheapest_map
 from ratslam.mapping.map_state import MapState
 from tactile.base.se2 import between, compose, integrate, wrap
 
-FILES = tuple(f"data/create_lab_{name}.csv" for name in ("truth", "bumps", "walls", "depth"))
-BUMPERS = ("right", "left", "front")
+FILES = tuple(f"data/create_lab_{name}.csv" for name in ("walls", "depth"))
 COLUMNS = (
     "session", "given at the end", "live", "its map", "doubt", "closures", "of them false",
     "candidates, right", "all true revisits instead",
 )  # fmt: skip
-PERCENTILES = (10, 50, 90)
-
 FALSE_DISTANCE, FALSE_TURN = 0.5, np.radians(30)
 """A closure is false if its true positions are further apart, m, or its claimed difference of headings is off
 by more. The room is 4.6 m wide."""
@@ -133,7 +129,7 @@ class CreateResult(NamedTuple):
     Attributes:
         variants: by name. true_turns: ATE of odometry with true turns, m. drift: range of
             odometry's heading error, rad. latency: median age of a depth reading, s. paths: [T, 3] poses
-            aligned with the truth, by name. walls: [W, 4] ends, m. distances: of `wall_distances`.
+            aligned with the truth, by name. walls: [W, 4] ends, m.
     """
 
     variants: dict[str, Variant]
@@ -142,17 +138,14 @@ class CreateResult(NamedTuple):
     latency: float
     paths: dict[str, np.ndarray]
     walls: np.ndarray
-    distances: tuple[np.ndarray, np.ndarray]
 
 
 def _measure_create(folder: Path) -> CreateResult:
     """Runs all sessions; in the folder of the repository, which holds `configs`."""
-    seen, bumps, walls, depth = (
+    walls, depth = (
         np.genfromtxt(path, delimiter=",", names=True) for path in require_recordings(folder, *FILES)
     )
     segments = np.stack([walls[name] for name in ("x1", "y1", "x2", "y2")], axis=1)
-    pressed = np.any([bumps[name] > 0 for name in BUMPERS], axis=0)
-    distances = wall_distances(np.stack([seen["x"], seen["y"]], axis=1), pressed, segments)
     # By the classic method, and by keyframes: with half, once and twice the cell size and sector width.
     rows = {name: row for name, row in buildings_rows().items() if row.section == "create"}
     configs = {"classic": rows[DEFAULT].recording.configuration("backend=classic")}
@@ -171,7 +164,7 @@ def _measure_create(folder: Path) -> CreateResult:
     paths["truth"] = truth
     true_turns = _true_turns_ate(odometry, truth)
     drift, latency = float(np.ptp(error)), float(np.median(depth["latency"]))
-    return CreateResult(variants, true_turns, drift, latency, paths, segments, distances)
+    return CreateResult(variants, true_turns, drift, latency, paths, segments)
 
 
 def _table_create(result: CreateResult) -> list[str]:
@@ -192,14 +185,8 @@ def _table_create(result: CreateResult) -> list[str]:
             cells.append(metres(variant.revisits))
         rows.append([label, *cells])
     rows.append(["odometry, true turns (bound)", metres(result.true_turns), *["-"] * 7])
-    walls = []
-    names = "at the first reading of a contact", "at all readings (control)"
-    for name, values in zip(names, result.distances, strict=True):
-        spread = np.percentile(values, PERCENTILES)
-        walls.append([name, len(values), *(f"{value:.3f}" for value in spread)])
-    columns = "robot to the nearest wall, m", "number", *(f"{p} %" for p in PERCENTILES)
     caveats = CAVEATS.format(drift=result.drift, latency=result.latency)
-    return table_lines([], COLUMNS, rows, table_lines([_summary(result)], columns, walls, [caveats]))
+    return table_lines([], COLUMNS, rows, [_summary(result), "", caveats])
 
 
 CAVEATS = (
@@ -227,10 +214,10 @@ def _summary(result: CreateResult) -> str:
 
 
 def _draw_create(result: CreateResult, png: Path) -> None:
-    """Draws the room with true and estimated paths, and the distances from the wall."""
+    """Draws the room with true and estimated paths."""
     line = "nine depth rays, default settings; rigid alignment with the overhead camera"
-    figure = new_figure(8.0, "A real Create in a walled room", line)
-    room = add_axes(figure, 0.62, 3.0, 7.0, 4.1)
+    figure = new_figure(5.55, "A real Create in a walled room", line)
+    room = add_axes(figure, 0.62, 0.55, 7.0, 4.1)
     for wall in result.walls:
         room.plot(wall[::2], wall[1::2], color=INK, lw=1.6)
     doubt = result.variants[DEFAULT].doubt
@@ -244,17 +231,6 @@ def _draw_create(result: CreateResult, png: Path) -> None:
     room.set_aspect("equal")
     room.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0.88, 1.0))
     name_axes(room, "x (m)", "y (m)")
-    below = add_axes(figure, 0.62, 0.55, 7.0, 1.8)
-    bins = np.arange(0.1, 0.8, 0.01)
-    contact, every = result.distances
-    for values, colour, label in (
-        (every, GREY, "all readings"),
-        (contact, VERMILLION, "first reading of a contact"),
-    ):
-        weights = np.full(len(values), 1 / len(values))
-        below.hist(values, bins.tolist(), weights=weights, color=colour, alpha=0.8, label=label)
-    below.legend(frameon=False, fontsize=9)
-    name_axes(below, "true distance from the robot to the nearest wall (m)", "share")
     figure.savefig(png)
 
 

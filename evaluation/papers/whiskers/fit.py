@@ -13,8 +13,8 @@ from evaluation.papers.tables.recordings import REACH, require_recordings
 from evaluation.plots import style
 from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import load_config
-from ratslam.service.record_fit import fit_revisits, read_signals_of_reach
-from ratslam.service.rig_fit import Rig, WheelFit, fit_wheels
+from ratslam.service.record_fit import read_signals_of_reach
+from ratslam.service.rig_fit import WheelFit, fit_wheels
 from robot.sources.in_memory import load_into_memory, select_rows
 from robot.sources.odometry import UNCORRECTED, correct_motions
 from tactile.base.plugins import PluginConfig
@@ -31,8 +31,8 @@ RECORDS = {
     "Freiburg 101": ("building", "buildings/freiburg_101_odom_gt.csv"),
 }
 """Configuration and odometry of each record with truth."""
-CREATE, MAPPED = "real Create", ("Intel lab", "ACES")
-"""The record that is drawn; those whose revisits are compared with the truth."""
+CREATE = "real Create"
+"""The record that is drawn."""
 VALUES = {
     "length_scale": (1.0, "distance, true / measured"),
     "turn_scale": (1.0, "turn, true / measured"),
@@ -41,9 +41,9 @@ VALUES = {
 """The quantities of the table: what is assumed, and the label of the axis."""
 
 
-_Record = tuple[list[WheelFit], list[tuple[np.ndarray, ...]], Rig | None]
+_Record = tuple[list[WheelFit], list[tuple[np.ndarray, ...]]]
 """The wheels of a record: fitted on all of it and on each half; of each half, its true path and the paths by
-odometry, as recorded and corrected by the fit of the other, [N, 3]; from revisits, where it was mapped."""
+odometry, as recorded and corrected by the fit of the other, [N, 3]."""
 _Rigs = tuple[dict[str, _Record], SignalRecord, SignalFit]
 """All records, and the whiskers of the arm."""
 
@@ -75,12 +75,12 @@ def _measure_wheels(name: str, folder: Path) -> _Record:
         known = np.isfinite(truth).all(axis=1)
         ways = (correct_motions(each, part.motion[:, :3]) for each in (UNCORRECTED, fit.correction))
         paths.append((truth[known], *(integrate(motion)[known] for motion in ways)))
-    return fits, paths, fit_revisits(config) if name in MAPPED else None
+    return fits, paths
 
 
 def _errors(records: dict[str, _Record]) -> np.ndarray:
     """[N, 2, 2] ATE of dead reckoning of N records, their halves, as recorded and corrected, m."""
-    every = [paths for _, paths, _ in records.values()]
+    every = [paths for _, paths in records.values()]
     return np.array([[[ate(path, true) for path in found] for true, *found in paths] for paths in every])
 
 
@@ -88,13 +88,8 @@ def _table(result: _Rigs) -> list[str]:
     """The wheels by record and half, dead reckoning before and after, and the whiskers of the arm."""
     records, signals, whiskers = result
     wheels = []
-    for name, (fits, _, revisits) in records.items():
-        cells = ["; ".join(_pair(getattr(fit, key)) for fit in fits) for key in VALUES]
-        wheels.append([name, *cells])
-        if revisits is not None:
-            known = {one.name: (one.value, one.sd or 0.0) for one in revisits.quantities}
-            turn, bias = _pair(known.get("turn scale")), _pair(known["heading bias"])
-            wheels.append([f"{name}, from revisits alone", "not told by revisits", turn, bias])
+    for name, (fits, _) in records.items():
+        wheels.append([name, *("; ".join(_pair(getattr(fit, key)) for fit in fits) for key in VALUES)])
     reckoned = (
         [name, *(f"{error:.2f}" for error in errors.flat)]
         for name, errors in zip(records, _errors(records), strict=True)
@@ -152,7 +147,7 @@ def _draw(result: _Rigs, png: Path) -> None:
     figure = style.new_figure(9.6, title, line)
     for k, key in enumerate(VALUES):
         _draw_intervals(style.add_axes(figure, 1.25 + 2.25 * k, 6.25, 1.95, 2.15), records, key, k == 0)
-    fits, paths, _ = records[CREATE]
+    fits, paths = records[CREATE]
     for k, half in enumerate(("first half", "second half")):
         other = fits[2 - k].correction
         how = ", corrected by the other" if other != UNCORRECTED else ": the other is not sure"

@@ -264,6 +264,6 @@ def test_a_renamed_network_closes_the_same_loops_and_one_without_places_none(tmp
         lesions = belief_lesions.measure_lesions(Task(31001, sessions=1), CHOSEN, ("short",))
     ((_, _, true),), ((_, same, _),), ((figures, other, _),) = (lesions[name, "short"] for name in CHOSEN)
     assert true > 0
-    assert (same, other, figures.metrics.closures) == (1, 0, 0)
+    assert (same, other, figures.record["closures"]) == (1, 0, 0)
     (row,) = (row for row in table_rows("lesions", lesions, tmp_path) if row[0].startswith(CHOSEN[2]))
     assert row[3:5] == ["0, 0", "0%"]

@@ -13,10 +13,10 @@ from evaluation.papers.maps.arenas import GRID, REPORTS, SOON, arena_figures, sh
 from evaluation.papers.maps.goals import GOALS, ClosedLoop, Drive, goal_figures, shortest_driven
 from evaluation.papers.maps.localising import Judged
 from evaluation.papers.maps.merged_maps import Join
-from evaluation.papers.maps.operations import Localised, MapTask, Measured, Methods, reproduce_maps
+from evaluation.papers.maps.operations import Localised, MapTask, Methods, reproduce_maps
 from evaluation.papers.maps.scenarios import Recipe, Recorded, open_world
 from evaluation.papers.maps.stored_maps import STEPS, MapArrays, StoredMap, store_map
-from evaluation.papers.tables.comparison import read_sessions
+from evaluation.papers.tables.comparison import Measured, read_sessions
 from evaluation.papers.tables.touch_table import MAIN, touch_config
 from ratslam.live.goal_drive import DriveState
 from robot.world.maze import CELL_SIDE, Cell, cell_centre

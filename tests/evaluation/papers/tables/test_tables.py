@@ -19,7 +19,7 @@ from evaluation.papers.tables import grid_table as grid
 from evaluation.papers.tables import touch_table as touch
 from evaluation.papers.tables.batches import Recording, RecordingSession, SessionBatch
 from evaluation.papers.tables.closures import closures_table, fit_weights
-from evaluation.papers.tables.comparison import Record, SessionLog, read_sessions
+from evaluation.papers.tables.comparison import Measured, Record, SessionLog, read_sessions
 from evaluation.papers.tables.markdown import markdown_header, markdown_row, select_rows
 from evaluation.papers.trial_sessions import ClosureClaims
 from evaluation.studies import machine
@@ -37,11 +37,15 @@ METRICS = TouchMetrics(
     relocalisations=90, closures=100, false_closures=3, experiences=50, steps=200,
 )  # fmt: skip
 TOLD = {"revisits_closed": 0.8, "em_live": 0.04, "em_pieces": 0.008, "unjoined": 0.1, "across": 40}
-SESSION = touch.SessionFigures(METRICS, **TOLD, recovery=())
 ARENA = 0.02, 0.2, np.radians([1.0, 20.0]), 4, [0.9, 0.4, 0.3, 0.04, 0.05]
 
 
-def stub_sessions(monkeypatch, module, result):
+def touched(whisks=(), **changed):
+    """A touch session with other figures than the usual ones."""
+    return Measured(METRICS._asdict() | TOLD | {"kidnaps": len(whisks)} | changed, {"whisks": whisks})
+
+
+def stub_sessions(monkeypatch, result):
     """Replaces the sessions of a table; returns the tasks that it asks for."""
     tasks = []
 
@@ -49,7 +53,7 @@ def stub_sessions(monkeypatch, module, result):
         tasks.extend(requested)
         return (result(task) for task in requested)
 
-    monkeypatch.setattr(module, "run_tasks", run_tasks)
+    monkeypatch.setattr(comparison, "run_tasks", run_tasks)
     return tasks
 
 
@@ -76,19 +80,19 @@ def test_rows_are_valid_configurations(config_of, row):
 
 
 def test_a_touch_row_gives_medians_worst_values_sums_and_kidnaps(monkeypatch):
-    worse = SESSION._replace(metrics=METRICS._replace(em=5.0, arcr=0.1))
-    tasks = stub_sessions(monkeypatch, touch, lambda task: worse if task.maze == 31002 else SESSION)
+    worse = touched(em=5.0, arcr=0.1)
+    tasks = stub_sessions(monkeypatch, lambda task: worse if task.maze == 31002 else touched())
     _, row = touch.touch_table(["clean"], first=31000, sessions=4)
     assert [(task.maze, task.seed) for task in tasks] == [(31000, 0), (31001, 1), (31002, 2), (31003, 3)]
     assert row == (
         "| clean: 2 mm / 0.5 deg | 0.010 (5.00) | 0.040 | 2.00 | 1 of 4 [5-70 %] | 1 of 4 [5-70 %] (2.50) "
         "| 0.020 | 0.500 | 0.900 (0.10), 0.950 | 0.80 | 12 / 400 |"
     )
-    missing = METRICS._replace(arcr=np.nan, arcr_chain_free=0.0, closures=0, false_closures=0)
-    stub_sessions(monkeypatch, touch, lambda task: SESSION._replace(metrics=missing))
+    missing = touched(arcr=np.nan, arcr_chain_free=0.0, closures=0, false_closures=0)
+    stub_sessions(monkeypatch, lambda task: missing)
     _, row = touch.touch_table(["control: shuffled"], sessions=1)
     assert row.endswith("| 0.500 | - | 0.80 | 0 / 0 |")
-    stub_sessions(monkeypatch, touch, lambda task: SESSION._replace(recovery=(10, 20, 90)))
+    stub_sessions(monkeypatch, lambda task: touched((10, 20, 90)))
     text = "\n".join(touch.touch_table(["kidnaps", "control: other maze"], sessions=1))
     pieces = "kidnaps: EM within pieces of the map, median 0.008 (0.01)"
     outside = "outside the largest piece, median 10% (10%)"
@@ -97,18 +101,18 @@ def test_a_touch_row_gives_medians_worst_values_sums_and_kidnaps(monkeypatch):
 
 
 def test_a_grid_row_compares_with_dead_reckoning(monkeypatch):
-    tasks = stub_sessions(monkeypatch, grid, lambda task: ARENA)
-    _, row = grid.grid_table([("A", "bias")], arenas=2, first=7)
+    tasks = stub_sessions(monkeypatch, lambda task: ARENA)
+    _, row = grid.grid_table(["bias"], ["A"], arenas=2, first=7)
     assert tasks == [("A", "bias", 7), ("A", "bias", 8)]
     assert "| 0.200 m | 0.020 | 0.10 | 2, 2 of 2 | 10.5 degrees, 50%, 50% |" in row
 
 
 def test_all_rows_without_data_are_named(monkeypatch, tmp_path):
     monkeypatch.delenv(recordings.DATA, raising=False)
-    stub_sessions(monkeypatch, buildings, lambda task: pytest.fail("a session without a recording"))
+    stub_sessions(monkeypatch, lambda task: pytest.fail("a session without a recording"))
     monkeypatch.chdir(tmp_path)
     rows = buildings.buildings_rows()
-    for names, table in ((buildings.ROWS, buildings.laser_table()), (rows, buildings.buildings_table(rows))):
+    for names, table in ((buildings.ROWS, buildings.laser_table()), (rows, buildings.buildings_table())):
         text = "\n".join(table)
         assert all(f"Left out: {row}: " in text for row in names)
         assert "set RATSLAM_DATA" in text
@@ -129,11 +133,12 @@ def test_closures_are_false_by_distance_or_claimed_turn_and_counted_in_a_row_of_
         name: buildings.BuildingsRow(recordings.Recording(name, "configs/square.yaml"), section, copies)
         for name, copies, section in (("lab", "miscalibrated", "buildings"), ("ids", "ids lost", "ids"))
     }
-    closures, sequences = np.array([False, True]), np.array([[True, False], [True, True], [False, True]])
-    harmless = buildings.RunFigures(10.0, 1.0, 10.8, closures, sequences, np.array([4.0, np.nan, -4.0]))
-    harmed = harmless._replace(odometry=2.0, final=2.5, live=2.0)
-    tasks = stub_sessions(monkeypatch, buildings, lambda task: harmed if task[2] == 2 else harmless)
-    _, lab, ids, _, total, note = buildings.buildings_table(rows, copies=2)
+    odds = {"calibration": np.array([[4.0, False], [np.nan, True], [-4.0, True]])}
+    harmless = Measured({"odometry": 10.0, "final": 1.0, "live": 10.8} | COUNTS, odds)
+    harmed = Measured({"odometry": 2.0, "final": 2.5, "live": 2.0} | COUNTS, odds)
+    tasks = stub_sessions(monkeypatch, lambda task: harmed if task[2] == 2 else harmless)
+    monkeypatch.setattr(buildings, "buildings_rows", lambda: rows)
+    _, lab, ids, _, total, note = buildings.buildings_table(copies=2)
     assert [task[1:] for task in tasks[:3]] == [("miscalibrated", seed) for seed in range(3)]
     assert lab == (
         "| lab | 10.00 | 1.00 | 10.80 | 1.75, 2.50 | 6.40, 10.80 | 1.25 | 1, 0 of 3 | 1 / 2 | 3 / 6 | 3 / 6 |"
@@ -144,6 +149,7 @@ def test_closures_are_false_by_distance_or_claimed_turn_and_counted_in_a_row_of_
     assert note == "ids lost: worst copy 2.50 times the ATE as is."
 
 
+COUNTS = {"closures": 2, "false_closures": 1, "sequences": 2, "false_sequences": 1}
 FIT, CONTRADICT = 3, 0
 
 
@@ -165,7 +171,7 @@ def test_the_regression_finds_the_views_that_tell_and_is_tested_on_other_session
     assert np.all(within.argmax(axis=1) == FIT)
     assert np.all(weights[:, [3, 4, 3 + KINDS, 4 + KINDS]] <= 0)
     monkeypatch.setattr(closures, "run_tasks", lambda _, tasks, workers: map(session, range(len(tasks))))
-    _, *lines, fitted = closures_table(sessions=2, folder=tmp_path)
+    _, *lines, fitted = closures_table(sessions=2, output=tmp_path)
     assert [line.split(" | ")[0] for line in lines] == [f"| {row}" for row in (*closures.ROWS, "all")]
     assert set(closures.ROWS) <= set(touch.ROWS)
     assert float(lines[-1].split(" | ")[6]) > 0.9
@@ -217,7 +223,8 @@ def write(folder: Path, sessions: Sessions, name: str = "touch.csv") -> Path:
 
 
 def logged(folder: Path, old: Sessions, new: Sessions, name: str = "touch") -> SessionLog:
-    log = SessionLog(name, (None, write(folder / "old", old, f"{name}.csv")), new)
+    rows = {row: [session for own, session in new if own == row] for row, _ in new}
+    log = SessionLog(name, None, write(folder / "old", old, f"{name}.csv"), rows)
     for (row, session), record in new.items():
         log.add(row, session, record)
     return log
@@ -229,38 +236,36 @@ def compared(folder: Path, old: Sessions, new: Sessions) -> list[str]:
 
 
 def stub_errors(monkeypatch: pytest.MonkeyPatch, em: dict[int, float]) -> None:
-    metrics = [METRICS._replace(em=value, arcr=np.nan) for value in em.values()]
-    found = dict(zip(em, metrics, strict=True))
-    told = {"em_live": 0.4, "recovery": (10, 20, 90)}
-    stub_sessions(monkeypatch, touch, lambda task: SESSION._replace(metrics=found[task.maze], **told))
+    told = {"em_live": 0.4, "arcr": np.nan}
+    stub_sessions(monkeypatch, lambda task: touched((10, 20, 90), em=em[task.maze], **told))
 
 
 def test_each_touch_session_is_in_the_file_as_soon_as_it_is_done(tmp_path: Path, monkeypatch) -> None:
     stub_errors(monkeypatch, {1: 0.1, 2: 0.2})  # the third one fails
     with pytest.raises(KeyError):
-        list(touch.touch_table(["clean"], 1, 3, files=(tmp_path / "new" / "run", None)))
+        list(touch.touch_table(["clean"], 1, 3, output=tmp_path / "new" / "run"))
     one, two = csv.DictReader((tmp_path / "new" / "run" / "touch.csv").read_text().splitlines())
     told = [[row[name] for name in ("row", "session", "em")] for row in (one, two)]
     assert told == [["clean", "1", "0.1"], ["clean", "2", "0.2"]]
     assert one["code"].endswith(" recall")
-    assert {*TouchMetrics._fields, *touch.SessionFigures._fields} - {"metrics"} <= set(one)
-    assert (one["arcr"], one["kidnaps"], one["recovery"], one["steps"]) == ("", "3", "20.0", "200")
+    assert {*TouchMetrics._fields, *TOLD} <= set(one)
+    assert (one["arcr"], one["kidnaps"], one["steps"]) == ("", "3", "200")
 
 
 def test_buildings_write_each_run_and_compare_maps_worse_than_odometry(tmp_path: Path, monkeypatch) -> None:
-    def runs(final: float, files: comparison.Files) -> list[str]:
-        closures, sequences = np.array([True, False]), np.array([[True, True], [True, False], [False, True]])
-        figures = buildings.RunFigures(1.0, final, 1.2, closures, sequences, np.zeros(3))
-        monkeypatch.setattr(buildings, "run_tasks", lambda _, tasks, workers: iter([figures] * len(tasks)))
-        return list(buildings.buildings_table(rows, 6, files=files))
+    def runs(final: float, **folder: Path) -> list[str]:
+        found = {"odometry": 1.0, "final": final, "live": 1.2} | COUNTS
+        stub_sessions(monkeypatch, lambda task: Measured(found, {"calibration": np.zeros((3, 2))}))
+        return list(buildings.buildings_table(copies=6, **folder))
 
     lab = recordings.Recording("lab", "configs/square.yaml")
     rows = {"lab": buildings.BuildingsRow(lab, "buildings", "miscalibrated")}
-    runs(0.5, (tmp_path, None))
+    monkeypatch.setattr(buildings, "buildings_rows", lambda: rows)
+    runs(0.5, output=tmp_path)
     first, *others = csv.DictReader((tmp_path / "buildings.csv").read_text().splitlines())
     assert [one["session"] for one in others] == list("123456")
     assert list(first.values())[3:] == ["1.0", "0.5", "1.2", "2", "1", "2", "1"]
-    *_, line, _, failures, _ = runs(1.5, (None, tmp_path))
+    *_, line, _, failures, _ = runs(1.5, against=tmp_path)
     assert line == (
         "| lab | 7 | 3.000 [3.000-3.000] | 1.000 [1.000-1.000] | 0.500, 1.500 | 0, 7 | 0, 0 "
         "| 7 / 14, 7 / 14 | 7 / 14, 7 / 14 | 0, 7 | 0, 7 (0.016) |"
@@ -319,7 +324,7 @@ VALUES = st.booleans() | st.integers() | st.floats(allow_nan=False)
 KEYS = st.tuples(st.sampled_from(["clean", "3 % faults, max"]), st.integers(1, 5).map(str))
 
 
-@given(st.dictionaries(KEYS, st.dictionaries(st.sampled_from(["a", "b", "c"]), VALUES)))
+@given(st.dictionaries(KEYS, st.dictionaries(st.sampled_from(["a", "b", "c"]), VALUES), min_size=1))
 def test_a_file_is_read_as_it_was_written(tmp_path_factory, sessions: Sessions) -> None:
     path = tmp_path_factory.mktemp("run") / "touch.csv"
     path.write_text(text_of(sessions, "abc classic"))
@@ -331,8 +336,8 @@ def test_a_file_is_read_as_it_was_written(tmp_path_factory, sessions: Sessions) 
 
 def test_a_file_keeps_other_sessions_with_the_code_that_measured_them(tmp_path: Path, monkeypatch) -> None:
     def add(row: str, em: float, settings: str) -> dict[str, tuple[str, object]]:
-        log = SessionLog("touch", (tmp_path, None), [(row, "1")], settings)
-        log.add(row, 1, {"em": em})
+        log = SessionLog("touch", tmp_path, None, {row: ["1"]}, settings)
+        log.add(row, "1", {"em": em})
         read = read_sessions(tmp_path / "touch.csv")
         return {key[0]: (code, figures["em"]) for key, (code, figures) in read.items()}
 
@@ -353,7 +358,7 @@ def test_a_file_keeps_other_sessions_with_the_code_that_measured_them(tmp_path: 
     ("row,session,code\nclean,31100,c\nclean,31100,c\n", "touch.csv:3: malformed"),
 ])  # fmt: skip
 def test_a_folder_that_cannot_be_compared_is_refused(text, said, tmp_path: Path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(touch, "run_tasks", lambda *_, **__: pytest.fail("work"))
+    stub_sessions(monkeypatch, lambda task: pytest.fail("work"))
     command = ["reproduce", "tables", "touch", "--rows", "clean", "--sessions", "1", "--against"]
     if text is not None:
         (tmp_path / "touch.csv").write_text(text)
@@ -369,11 +374,11 @@ def test_a_file_of_an_earlier_run_or_of_others_is_not_written_over(tmp_path: Pat
     file = write(tmp_path, {("clean", "1"): figures(0.3)}) / "touch.csv"
     before = file.read_bytes()
     with pytest.raises(InputError, match="is the folder of -o too"):
-        next(touch.touch_table(["clean"], 1, 1, files=(tmp_path, tmp_path)))
+        next(touch.touch_table(["clean"], 1, 1, output=tmp_path, against=tmp_path))
     assert file.read_bytes() == before
     file.write_text("theirs\n1\n")
     with pytest.raises(InputError, match="without 'row'"):
-        next(touch.touch_table(["clean"], 1, 1, files=(tmp_path, None)))
+        next(touch.touch_table(["clean"], 1, 1, output=tmp_path))
     assert file.read_text() == "theirs\n1\n"
 
 
