@@ -48,6 +48,7 @@ ODOMETRY_ERRORS = {
     "measured": "as of real Creates",
     "measured, calibrated": "as of real Creates, mean scales corrected",
 }
+_NO_WALLS, _GEOMETRIC = ({"touch": {"reports": {"walls": walls}}} for walls in ("none", "geometric"))
 _WIDE_DRIFT = {"grid": {"drift": {"heading_rate": 2e-3, "move": 0.08}}}
 """A heading drift of 0.12 rad/min, the RMS of real Creates, and larger errors of single moves."""
 ROWS: dict[str, dict[str, Any]] = {
@@ -56,13 +57,24 @@ ROWS: dict[str, dict[str, Any]] = {
     "white": {},
     "measured": {},
     "measured, calibrated": {},
+    "measured, blobs only": _NO_WALLS,
     "measured, wide drift": _WIDE_DRIFT,
+    "measured, calibrated, wide drift": _WIDE_DRIFT,
     "bias, wide drift": _WIDE_DRIFT,
     "move, wide drift": _WIDE_DRIFT,
-    "bias, blobs only": {"touch": {"reports": {"walls": "none"}}},
-    "bias, geometric": {"touch": {"reports": {"walls": "geometric"}}},
+    "bias, blobs only": _NO_WALLS,
+    "move, blobs only": _NO_WALLS,
+    "bias, geometric": _GEOMETRIC,
+    "move, geometric": _GEOMETRIC,
     "bias, as printed": {"grid": AS_PRINTED},
     "move, as printed": {"grid": AS_PRINTED},
+    "bias without run errors": {"grid": {"drift": {"session": 0.0}}},
+    "move, temper 1, prior 0.3": {"grid": {"likelihood": {"free": 1.0, "unexplored": 0.3}}},
+    "bias, BACK skipped": {},
+    "move, BACK skipped": {},
+    "bias, 1000 particles": {"grid": {"particles": 1000}},
+    "move, 1000 particles": {"grid": {"particles": 1000}},
+    "move, no compass": {"grid": {"likelihood": {"wall_direction_prior": False}}},
 }
 """Settings; the name begins with the model of the odometry errors."""
 DEFAULT_ROWS = (
@@ -137,6 +149,11 @@ def measure_session(task: tuple[str, str, int]) -> GridFigures:
     if "calibrated" in row:
         observations = correct_observations(MEAN_ERRORS, observations)
     moves = np.array([observation.odometry[:3] for observation in observations])
+    if "BACK skipped" in row:
+        still = observations[0].odometry._replace(dx=0.0, dy=0.0, dtheta=0.0, dt=0.5)
+        observations = [
+            o._replace(odometry=still) if o.motion == MotionKind.BACK else o for o in observations
+        ]
     touch = report_config_of(source.info, config.touch.reports)
     session = session_at_start(grid, touch.mounts, touch.length, "float32", config.session.seed)
     online = np.array([step.pose for step in session.replay(observations)])

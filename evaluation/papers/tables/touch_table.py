@@ -53,11 +53,14 @@ _RECOVERY_LIMIT = 45
 
 MAIN: dict[str, Any] = {"motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}}}
 _ROUGH = {"motion": {"jitter": {"position": 0.010, "yaw_deg": 3.0, "speed": 0.10}}}
-KIDNAPS = {"kidnaps": {"count": 8, "ahead": 45.0}}
-EXPLORATION = {"path": {"explore": 1500}}
+_MAX_ANGLE = {"image": {"transform": "max_angle"}}
+KIDNAPS, _KIDNAPS_24 = ({"kidnaps": {"count": count, "ahead": 45.0}} for count in (8, 24))
+_CARRIED = {"may_be_carried": True}
+EXPLORATION, _LONG = {"path": {"explore": 1500}}, MAIN | {"path": {"explore": 5000}}
 _OPEN_ARENA, _TREE = (MAIN | EXPLORATION | {"maze": maze} for maze in ({"share": 0.08}, {"kind": "tree"}))
 NOISE = OdometryConfig()
 _NOISE_X_2 = {"length": 2 * NOISE.length, "heading": 2 * NOISE.heading}
+_OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
 class TouchRow(NamedTuple):
@@ -86,11 +89,16 @@ ROWS = {
     "rough, 3 % faults": TouchRow(
         "rough, 3 % contacts missed, 3 % spurious", _ROUGH | {"mechanics": {"missed": 0.03, "spurious": 0.03}}
     ),
+    "open, max_angle": TouchRow("open loop, max_angle", _OPEN_LOOP, _MAX_ANGLE),
     "white": TouchRow("white odometry noise", {"odometry": {"noise": "white"}}, sessions=20),
+    "telescoping": TouchRow("telescoping noise", {"odometry": {"noise": "telescoping"}}),
     "exploration": TouchRow("free exploration, 1500 whisks", EXPLORATION, sessions=40),
     "open arena": TouchRow("open arena, 8 % of the walls, free exploration", _OPEN_ARENA, sessions=20),
     "tree": TouchRow("maze without loops, free exploration", _TREE, sessions=20),
     "noise x 2": TouchRow("odometry noise x 2", MAIN | {"odometry": _NOISE_X_2}, sessions=20),
+    "exploration, 3000": TouchRow("free exploration, 3000 whisks", {"path": {"explore": 3000}}),
+    "exploration, 5000": TouchRow("free exploration, 5000 whisks", _LONG, sessions=5),
+    "kidnaps, 5000": TouchRow("5000 whisks with 24 kidnaps", _LONG | _KIDNAPS_24, {}, _CARRIED, sessions=5),
     "new ground": TouchRow("3000 whisks that enter no cell twice", MAIN, sessions=5, new_ground=3000),
     "5 x 5": TouchRow("5 x 5 cells", {"maze": {"columns": 5, "rows": 5, "loop": 12}}),
     "12 x 8": TouchRow("12 x 8 cells", {"maze": {"columns": 12, "rows": 8, "loop": 32}}),
@@ -100,6 +108,9 @@ ROWS = {
     "radii - 20 %": TouchRow("base radii - 20 %", {}, {"head": _head(0.036, 0.052, 0.064)}),
     "rest 90": TouchRow("rest angle + 20 %", {}, {"head": {"rest_deg": 90.0}}),
     "rest 60": TouchRow("rest angle - 20 %", {}, {"head": {"rest_deg": 60.0}}),
+    "radial channel": TouchRow("with the radial channel", {}, {"image": {"radial": True}}),
+    "2 Hz": TouchRow("2 Hz whisking", {"whisking": {"rate": 2.0}}),
+    "RCP, max_angle": TouchRow("RCP, max_angle", {}, _MAX_ANGLE),
     "1 dead": TouchRow("1 dead whisker", {}, {"head": {"dead": [10]}}),
     "6 dead": TouchRow("6 dead whiskers", {}, {"head": {"dead": [1, 6, 7, 10, 14, 17]}}),
     "noise 1e-3": TouchRow("sensor noise 1e-3 rad", {"mechanics": {"noise": 1e-3}}),
@@ -109,11 +120,19 @@ ROWS = {
         "main from raw samples with drift, colour and creep",
         MAIN | {"mechanics": {"baseline": HALL_BASELINE.model_dump()}},
     ),
-    "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, {"may_be_carried": True}),
+    "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, _CARRIED),
     "control: shuffled": TouchRow("control: shuffled images", MAIN),
     "control: no image": TouchRow("control: no images", MAIN),
     "control: other maze": TouchRow("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),
+    "open, contact_angle": TouchRow("open loop, contact_angle", _OPEN_LOOP),
+    "noise 5e-3": TouchRow("sensor noise 5e-3 rad", {"mechanics": {"noise": 5e-3}}),
+    "soft servo, open, max": TouchRow(
+        "soft servo, open loop, max_angle", _OPEN_LOOP | {"mechanics": {"servo": 0.3}}, _MAX_ANGLE
+    ),
+    "soft servo, RCP, max": TouchRow("soft servo, RCP, max_angle", {"mechanics": {"servo": 0.3}}, _MAX_ANGLE),
 }
+DEFAULT_ROWS = tuple(ROWS)[:-4]
+"""The rows printed if none are chosen."""
 COMPARED = Compared(
     "EM", "em", "em_live", "em_odometry",
     worse=lambda error, odometry: error > TOLERANCE * odometry,
@@ -153,14 +172,14 @@ def touch_table(
     """The lines of the table, each as soon as its sessions are done.
 
     Args:
-        rows: None: all. first: number of the first maze; each session has the next one. sessions:
+        rows: None: `DEFAULT_ROWS`. first: number of the first maze; each session has the next one. sessions:
             of each row; None: the row's own number. output, against: see `SessionLog`; the file is
             `touch.csv`.
 
     Raises:
         InputError: no such row, or a file cannot be used.
     """
-    rows = select_rows(rows, ROWS)
+    rows = select_rows(rows, ROWS, DEFAULT_ROWS)
     tasks = {
         row: {str(maze): TouchTask(row, maze, backend) for maze in range(first, first + number)}
         for row, number in ((row, sessions or ROWS[row].sessions) for row in rows)
