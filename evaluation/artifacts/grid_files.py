@@ -22,11 +22,7 @@ from tactile.base.files import write_atomically, write_text_atomically
 
 
 def read_grid(path: str | Path) -> OccupancyGrid:
-    """Reads the map of a run with a grid.
-
-    Raises:
-        InputError: the file is missing or malformed.
-    """
+    """Reads the map of a run with a grid."""
 
     def parse(probability: np.ndarray, origin: np.ndarray, cell: np.ndarray) -> OccupancyGrid:
         grid = OccupancyGrid(probability.astype(float), origin.astype(float).reshape(2), float(cell))
@@ -40,16 +36,11 @@ def read_grid(path: str | Path) -> OccupancyGrid:
 def write_grid_truth(path: str | Path, truth: GridTruth, start: np.ndarray) -> None:
     """Writes the truth in the frame of the map, and `start` [3]: the pose of that frame (where the robot
     started) in the frame of the true poses."""
-    with Path(path).open("wb") as file:
-        np.savez_compressed(file, **truth._asdict(), start=start)
+    np.savez_compressed(path, **truth._asdict(), start=start)
 
 
 def read_grid_truth(path: str | Path) -> tuple[GridTruth, np.ndarray]:
-    """The inverse of `write_grid_truth`.
-
-    Raises:
-        InputError: the file is missing or malformed.
-    """
+    """The inverse of `write_grid_truth`."""
 
     def parse(*arrays: np.ndarray) -> tuple[GridTruth, np.ndarray]:
         occupied, inside, segments, start = arrays
@@ -97,11 +88,7 @@ def write_nav2(folder: Path, grid: OccupancyGrid, name: str = "map") -> None:
 
 
 def read_nav2(path: str | Path) -> Nav2Map:
-    """Reads map.yaml and its image like map_server (modes trinary, scale and raw; binary 8-bit PGM).
-
-    Raises:
-        InputError: a file or a key is missing or invalid.
-    """
+    """Reads map.yaml and its image like map_server (modes trinary, scale and raw; binary 8-bit PGM)."""
     path = Path(path)
     given = read_plain_yaml(path, "the map.yaml of a map_server")
     keys = ("resolution", "free_thresh", "occupied_thresh")

@@ -35,11 +35,7 @@ def write_pieces(path: Path, time: np.ndarray, piece: np.ndarray) -> None:
 
 
 def _read_pieces(path: Path, steps: int) -> np.ndarray:
-    """The piece [steps] of each step, 0 without the file.
-
-    Raises:
-        InputError: a line is malformed, or there are fewer than `steps`.
-    """
+    """The piece [steps] of each step, 0 without the file."""
     if not path.exists():
         return np.zeros(steps, int)
     piece = read_text_table(path, dict.fromkeys(PIECE_COLUMNS, ()))[0][:, 1]
@@ -66,11 +62,7 @@ def _refuse_merged(folder: Path) -> None:
 
 
 def read_session_steps(folder: Path) -> list[int]:
-    """Number of steps of each session of a merged folder, in the order of its map.
-
-    Raises:
-        InputError: merge.json is missing or malformed.
-    """
+    """Number of steps of each session of a merged folder, in the order of its map."""
     expected = f"the {MERGE_REPORT} of a merged map"
     return read_json(folder / MERGE_REPORT, expected, lambda content: list(map(int, content["steps"])))
 
@@ -163,11 +155,7 @@ def has_steps(path: Path) -> bool:
 
 
 def read_scorecard(path: Path) -> Scorecard:
-    """Reads the scorecard in a run directory.
-
-    Raises:
-        InputError: it is missing or malformed.
-    """
+    """Reads the scorecard in a run directory."""
     file = path / "scorecard.json"
     return read_json(file, "the directory of a scored run", Scorecard.model_validate)
 
@@ -183,11 +171,7 @@ def write_walls(path: str | Path, walls: np.ndarray) -> None:
 
 
 def read_walls(path: Path) -> np.ndarray:
-    """Reads the walls [B, 5] of a run directory; B is 0 without the file.
-
-    Raises:
-        InputError: a line is malformed.
-    """
+    """Reads the walls [B, 5] of a run directory; B is 0 without the file."""
     file = path / "walls.csv"
     if not file.exists():
         return np.zeros((0, len(WALL_COLUMNS)))
@@ -218,9 +202,6 @@ def read_columns(path: Path, *names: str, empty: float | None = None) -> list[np
 
     Args:
         empty: value of an empty cell; None: an empty cell is an error.
-
-    Raises:
-        InputError: the file is missing, or a row has no number in one of the columns.
     """
     text, found = read_text(path, "a file of a run directory"), []
     header, *lines = text[: text.rfind("\n") + 1].splitlines() or [",".join(names)]
@@ -302,11 +283,7 @@ class Manifest(NamedTuple):
 
 
 def read_manifest(directory: Path) -> Manifest:
-    """Reads the manifest; that of a run without the file has no versions.
-
-    Raises:
-        InputError: the file, or the report of a live session, is malformed.
-    """
+    """Reads the manifest; that of a run without the file has no versions."""
     file = directory / "manifest.json"
     found = read_json(file, "the manifest of a run", _parse_manifest) if file.exists() else Manifest()
     if found.status != RUNNING:
@@ -371,11 +348,7 @@ class ClosureTable(NamedTuple):
 
 
 def read_closure_table(directory: Path) -> ClosureTable:
-    """Reads the closures of a run directory; none without the file.
-
-    Raises:
-        InputError: a line is malformed.
-    """
+    """Reads the closures of a run directory; none without the file."""
     file = directory / "closures.csv"
     if not file.exists():
         return ClosureTable(np.zeros((0, 2), int), [], {})
@@ -396,11 +369,7 @@ def read_closure_table(directory: Path) -> ClosureTable:
 
 
 def read_closures(directory: Path) -> np.ndarray:
-    """The pairs of steps [n, 2] of this run that are joined by accepted closures; n is 0 without the file.
-
-    Raises:
-        InputError: a line is malformed.
-    """
+    """The pairs of steps [n, 2] of this run that are joined by accepted closures; n is 0 without the file."""
     table = read_closure_table(directory)
     return table.steps[table.accepted() & (table.steps >= 0).all(axis=1)]
 
@@ -432,13 +401,11 @@ def count_closures(path: Path) -> Closures | None:
 
 
 CHANGES = "changes.csv"
-CHANGE_COLUMNS = ("x", "y", "extent", "kind", "evidence", "alarms", "passes", "first_step", "last_step")
-"""m, m, m; `new`, `gone` or `different`; nat; expected number by chance; number of passes; steps of the
-session that contradict."""
 
 
 class ChangeRow(NamedTuple):
-    """One place, see `CHANGE_COLUMNS`."""
+    """One place, a line of the file: m, m, m; `new`, `gone` or `different`; nat; expected number by chance;
+    number of passes; steps of the session that contradict."""
 
     x: float
     y: float
@@ -471,16 +438,12 @@ class ChangeRow(NamedTuple):
 def write_changes(path: Path, changes: Sequence[ChangeRow]) -> None:
     """Writes the places, the surest first."""
     with path.open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([CHANGE_COLUMNS, *changes])
+        csv.writer(file, lineterminator="\n").writerows([ChangeRow._fields, *changes])
 
 
 def read_changes(path: Path) -> list[ChangeRow]:
-    """Reads the places.
-
-    Raises:
-        InputError: a line is malformed.
-    """
-    return read_rows(path, f"the columns {', '.join(CHANGE_COLUMNS)}", ChangeRow.parse)
+    """Reads the places."""
+    return read_rows(path, f"the columns {', '.join(ChangeRow._fields)}", ChangeRow.parse)
 
 
 CLOSURE_VIEWS = "closure_views.npz"
@@ -505,16 +468,11 @@ def eight_bit(view: np.ndarray) -> np.ndarray:
 
 def write_closure_views(path: Path, views: ClosureViews) -> None:
     """Writes the file; equal views give equal bytes."""
-    with Path(path).open("wb") as file:
-        np.savez_compressed(file, step=views.step, view=views.view)
+    np.savez_compressed(path, step=views.step, view=views.view)
 
 
 def read_closure_views(directory: Path) -> ClosureViews | None:
-    """Reads the views of a run directory; None without the file.
-
-    Raises:
-        InputError: the file is malformed.
-    """
+    """Reads the views of a run directory; None without the file."""
 
     def parse(step: np.ndarray, view: np.ndarray) -> ClosureViews:
         if step.ndim != 1 or view.ndim != 3 or len(step) != len(view) or view.dtype != np.uint8:
@@ -551,16 +509,11 @@ def write_whisker_views(path: str | Path, images: WhiskerViews) -> None:
     arrays = {name: np.asarray(array) for name, array in images._asdict().items()}
     # Rounded up, so that a whisker in contact is never 0.
     arrays["view"] = np.ceil(_WHITE * images.view).astype(np.uint8)
-    with Path(path).open("wb") as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
 
 def read_whisker_views(path: str | Path) -> WhiskerViews:
-    """The inverse of `write_whisker_views`, except for rounding.
-
-    Raises:
-        InputError: the file is missing or malformed.
-    """
+    """The inverse of `write_whisker_views`, except for rounding."""
 
     def parse(view: np.ndarray, *arrays: np.ndarray) -> WhiskerViews:
         alive, azimuth, length, tallest = arrays

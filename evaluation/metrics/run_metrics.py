@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.metrics.energy_metric import Energy, Relations, energy, energy_all_pairs, relation_errors
-from evaluation.metrics.exm import EXM_MODES, ExmConfig, base_end, change_rows, experience_metric
+from evaluation.metrics.exm import DEFAULT_EXM, EXM_MODES, ExmConfig, base_end, change_rows, experience_metric
 from evaluation.metrics.metric import Direction, Finding, Metric, Quantity
 from evaluation.metrics.trajectory import (
     align,
@@ -303,6 +303,8 @@ _PAIRS = {
 }
 PIECES = "Pieces"
 """Heading of the metrics of a map in several pieces."""
+PAIR_GAP = 10
+"""Distance of the pairs of `energy_gap`, steps."""
 _PARTS = (("", "", "m2+rad2"), ("_trans2", ", trans", "m2"), ("_rot2", ", rot", "rad2"))
 RUN_METRICS: tuple[Metric, ...] = (
     _metric("steps", "steps", "", None, "Extent"),
@@ -341,13 +343,8 @@ DOUBTED = 0.7
 """Probability of being worse than odometry above which a map is doubted (`ratslam.mapping.map_solution`)."""
 
 
-def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: int) -> RunData:
-    """Computes the findings of a run.
-
-    Args:
-        relations: true relative motions of the recording, if any. gap: distance of the pairs of
-            `energy_gap`, steps.
-    """
+def run_data(run: RunArrays, exm: ExmConfig = DEFAULT_EXM, relations: Relations | None = None) -> RunData:
+    """Computes the findings of a run; `relations` are true relative motions of the recording, if any."""
     rows, truth = run.truth_rows, run.truth
     note = "map_doubted: the trajectory is odometry" if run.doubt > DOUBTED else ""
     findings = {
@@ -370,7 +367,7 @@ def run_data(run: RunArrays, exm: ExmConfig, relations: Relations | None, gap: i
     if len(rows) < len(run.time):
         findings["steps"] = Finding(len(run.time), note=f"{len(rows)} of them with a true pose")
     findings["path"] = Finding(path_length(truth[rows]), path_length(run.odometry[rows]))
-    compared = _trajectories(run, truth, rows) | _energies(run, truth, rows, gap)
+    compared = _trajectories(run, truth, rows) | _energies(run, truth, rows)
     if run.has_pieces:  # links are within pieces; all others compare poses of different pieces
         reason = "across pieces that nothing joins"
         for name in (name for name in compared if not name.startswith("energy_links")):
@@ -420,17 +417,17 @@ def _piece_findings(run: RunArrays, rows: np.ndarray) -> dict[str, Finding]:
     return found | {"ate_within_pieces": Finding(error, raw_error, "each piece aligned by itself")}
 
 
-def _energies(run: RunArrays, truth: np.ndarray, rows: np.ndarray, gap: int) -> dict[str, Finding]:
+def _energies(run: RunArrays, truth: np.ndarray, rows: np.ndarray) -> dict[str, Finding]:
     at = rows[change_rows(run.experience[rows])]
     final, odometry, true = run.final[rows], run.odometry[rows], truth[rows]
     links = run.links[np.isin(run.created, rows)[run.links].all(axis=1)]
     born, raw = truth[run.created], run.odometry[run.created]
-    moves, near, far = (successive_pairs(*size) for size in ((len(at),), (len(rows),), (len(rows), gap)))
+    moves, near, far = (successive_pairs(*size) for size in ((len(at),), (len(rows),), (len(rows), PAIR_GAP)))
     ours = energy(run.nodes[run.experience[at]], truth[at], moves)
     return {
         **_energy("change", ours, energy(run.odometry[at], truth[at], moves)),
         **_energy("consecutive", energy(final, true, near), energy(odometry, true, near)),
-        **_energy("gap", energy(final, true, far), energy(odometry, true, far), f"k = {gap}; "),
+        **_energy("gap", energy(final, true, far), energy(odometry, true, far), f"k = {PAIR_GAP}; "),
         **_energy("links", energy(run.nodes, born, links), energy(raw, born, links)),
         **_energy("all", energy_all_pairs(final, true), energy_all_pairs(odometry, true)),
     }

@@ -89,20 +89,18 @@ def score_run(
     *,
     exm: ExmConfig = DEFAULT_EXM,
     relations: Relations | None = None,
-    gap: int = 10,
     metrics: Sequence[Metric] = (),
 ) -> Scorecard:
     """Scores one run; a quantity that is undefined (without truth, for example) is None with a reason.
 
     Args:
-        relations: true relative motions of the recording, if any.
-        gap: distance of the pairs of `energy_gap`, steps. metrics: computed besides `RUN_METRICS`.
+        relations: true relative motions of the recording, if any. metrics: computed besides `RUN_METRICS`.
 
     Raises:
         InputError: the arrays do not fit each other.
     """
     run.check()
-    data = run_data(run, exm, relations, gap)
+    data = run_data(run, exm, relations)
     known = bool(np.isfinite(run.doubt))
     health = HealthCard(
         input="warned" if run.warnings else "clean", warnings=run.warnings,

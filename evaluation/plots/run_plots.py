@@ -65,9 +65,6 @@ def plot_writers(directory: Path) -> dict[str, Callable[[Path], None]]:
     """The plots of `run_plots` as files: file name -> function that saves the plot to a path.
 
     Equal directories give equal bytes.
-
-    Raises:
-        InputError: a file is missing or malformed.
     """
     return {
         f"{name}.png": lambda path, draw=draw: draw().savefig(path)  # type: ignore[misc]

@@ -51,8 +51,7 @@ def run_charts(report: RunReport) -> dict[str, Any]:
         charts["belief"] = _figure(traces, "time, s", "probability")
         charts["belief"].update_yaxes(range=[-0.02, 1.02])
     if len(report.cost):
-        cost = np.column_stack([report.cost_step, 1e3 * report.cost])
-        shown = _line(cost, "mean of each chunk of steps", "final", width=1.4)
+        shown = _line(report.cost * [1, 1e3], "mean of each chunk of steps", "final", width=1.4)
         charts["cost"] = _figure([shown], "step", "ms a step")
         charts["cost"].update_yaxes(type="log", dtick=1)
     return {name: chart for name, chart in charts.items() if chart is not None}
@@ -119,15 +118,15 @@ def error_chart(reports: Sequence[RunReport]) -> Any | None:
         run, rows = report.run, report.run.truth_rows
         if run.truth is None or len(rows) == 0:
             continue
-        time, start = run.time[rows] - run.time[0], run.time[0]
+        time = run.time[rows] - run.time[0]
         final = np.column_stack([time, position_errors(run.final[rows], run.truth[rows])])
         if not alone:
             traces.append(_line(final, report.name, *_run_style(number)))
             continue
         odometry = np.column_stack([time, position_errors(run.odometry[rows], run.truth[rows])])
         traces.append(_line(odometry, "odometry", "odometry", width=1))
-        if len(report.online_time) and not run.has_pieces:  # it compares poses of different pieces
-            online = np.column_stack([report.online_time - start, report.online_error])
+        if len(report.online_error) and not run.has_pieces:  # it compares poses of different pieces
+            online = report.online_error - [run.time[0], 0.0]
             traces.append(_line(online, "map, as known at the time", "online", dash="dot", width=1.6))
         traces.append(_line(final, "final trajectory", "final", width=2))
     return _figure(traces, "time, s", "position error, m", zero=True) if traces else None

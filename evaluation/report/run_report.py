@@ -54,8 +54,8 @@ class RunReport(NamedTuple):
         spread: [N] standard deviation of the position at each step, m. belief: [n, 3] probability of the
             heaviest packet of the pose cells, of the second and of a new place, at the steps `belief_step`
             [n]; n = 0 of methods whose pose cells hold no belief.
-        online_error: [k] errors of the current pose at times `online_time` [k] s.
-        cost: [k] computing times a step, s, after `cost_step` [k] steps.
+        online_error: [k, 2] time, s, and error of the current pose then, m.
+        cost: [k, 2] number of steps, and mean computing time of one of the last of them, s.
         run: its arrays, pieces of the map as `arrange_pieces` draws them.
         layers: paths in the frame of the map, to which `layers.to_map` moves `walls`.
         map_path: [N, 2] the path of a doubted map in that frame; None: `layers.final` is that of the map.
@@ -73,9 +73,7 @@ class RunReport(NamedTuple):
     spread: np.ndarray
     belief: np.ndarray
     belief_step: np.ndarray
-    online_time: np.ndarray
     online_error: np.ndarray
-    cost_step: np.ndarray
     cost: np.ndarray
     layers: Layers
     map_path: np.ndarray | None
@@ -120,8 +118,7 @@ def read_run_report(directory: Path) -> RunReport:
     file, expected = directory / "gridscore.json", "the scores of a grid"
     score = read_json(file, expected, GridScore.model_validate) if file.exists() else None
     belief, belief_step = _belief(steps, count)
-    cost_step, steps_of, seconds = _columns(directory / "timing.csv", "step", "steps", "seconds")
-    online_time, online_error = _columns(directory / "online_error.csv", "t", "error")
+    step, steps_of, seconds = _columns(directory / "timing.csv", "step", "steps", "seconds").T
     return RunReport(
         name=name,
         manifest=read_manifest(directory),
@@ -133,10 +130,8 @@ def read_run_report(directory: Path) -> RunReport:
         spread=np.hypot(*read_columns(steps, "sd_x", "sd_y"))[:count],
         belief=belief,
         belief_step=belief_step,
-        online_time=online_time,
-        online_error=online_error,
-        cost_step=cost_step,
-        cost=seconds / np.maximum(steps_of, 1),
+        online_error=_columns(directory / "online_error.csv", "t", "error"),
+        cost=np.column_stack([step, seconds / np.maximum(steps_of, 1)]),
         layers=layers,
         map_path=_map_path(directory, measured),
         walls=read_walls(directory) if layers.truth is not None else np.zeros((0, 5)),
@@ -198,9 +193,9 @@ def _belief(steps: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(belief, axis=1)[at], at
 
 
-def _columns(file: Path, *names: str) -> list[np.ndarray]:
-    """Columns of a file; empty ones without it."""
-    return read_columns(file, *names) if file.exists() else [np.zeros(0)] * len(names)
+def _columns(file: Path, *names: str) -> np.ndarray:
+    """Columns of a file as an array; without rows if there is none."""
+    return np.column_stack(read_columns(file, *names)) if file.exists() else np.zeros((0, len(names)))
 
 
 VIEW_BYTES = 2_000_000

@@ -83,9 +83,6 @@ def summarise(directory: Path, card: Scorecard, method: str) -> str:
 
     Args:
         method: name of the backend.
-
-    Raises:
-        InputError: a file is missing or malformed.
     """
     run, source, closures = read_run(directory), read_manifest(directory).source, count_closures(directory)
     extent = f"{run.time[-1] - run.time[0]:.3g} s, {path_length(run.odometry):.3g} m by odometry"

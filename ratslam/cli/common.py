@@ -148,11 +148,7 @@ class _ListConfigs(argparse.Action):
 
 
 def read_config(arguments: argparse.Namespace) -> RunConfig:
-    """The configuration given by the arguments of `add_config`.
-
-    Raises:
-        InputErrors: all errors in it, each with its place.
-    """
+    """The configuration given by the arguments of `add_config`."""
     from ratslam.runs.settings.run_config import load_config
 
     return load_config(arguments.config, arguments.set)

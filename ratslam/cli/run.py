@@ -187,11 +187,7 @@ def add_rerun(parser: argparse.ArgumentParser) -> None:
 
 
 def open_target(arguments: argparse.Namespace) -> str | None:
-    """The target of the live view, or None without one.
-
-    Raises:
-        InputError: it cannot be used.
-    """
+    """The target of the live view, or None without one."""
     from ratslam.service.viewer_link import prepare_target
 
     return None if arguments.rerun is None else prepare_target(arguments.rerun)

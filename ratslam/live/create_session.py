@@ -19,6 +19,7 @@ from robot.simulation.create.state_machine import CreateState
 from robot.sources.source import SourceDescription
 from robot.world.arena import make_arena, wall_segments
 from tactile.base.errors import InputError
+from tactile.base.se2 import between
 from tactile.base.types import StepEnd
 
 SHORTEST_STEP = 0.25
@@ -55,15 +56,12 @@ class CreateSession(LiveRobot):
         info = describe_create(plan, arena)
         live = config.live.model_dump(mode="json", exclude={"create": {"plan": {"arena": {"file"}}}})
         whiskers = len(plan.whiskers.mounts)
-        # Largest distance of a wall from the start along the robot's first x or y axis, m.
-        x, y, heading = arena.start
-        offset = wall_segments(arena).reshape(-1, 2) - [x, y]
-        c, s = np.cos(heading), np.sin(heading)
-        ahead, left = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
+        ends = wall_segments(arena).reshape(-1, 2)
+        seen = between(arena.start, np.column_stack([ends, np.zeros(len(ends))]))  # from the start
         info = info.model_copy(update={"provenance": {**info.provenance, "live": live}})
         source = SourceDescription((1, whiskers, 1), whiskers, 1 / plan.behaviour.step, info)
         rows = plan.reports or ceil(60 * plan.minutes / SHORTEST_STEP)
-        extent = float(np.abs([ahead, left]).max())
+        extent = float(np.abs(seen[:, :2]).max())
         self.job = MappingJob(mapped_config(config, directory, rows), source, directory, extent)
         self.total = plan.reports
         self._ends: Counter[StepEnd] = Counter()

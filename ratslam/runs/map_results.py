@@ -131,11 +131,7 @@ def rewrite_results(folder: Path, made: Map, config: ScoreConfig) -> None:
 
 
 def score_and_plot(folder: Path, config: ScoreConfig) -> Scorecard:
-    """Scores a run directory and plots it; see `Runner.finish`.
-
-    Raises:
-        InputError: a file is missing or malformed.
-    """
+    """Scores a run directory and plots it; see `Runner.finish`."""
     relations = read_relations(config.relations) if config.relations else None
     metrics, exm = build_metrics(config.metrics), config.experience_metric
     card = score_run(read_run(folder), folder.name, exm=exm, relations=relations, metrics=metrics)

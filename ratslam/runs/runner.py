@@ -10,11 +10,11 @@ import hashlib
 import json
 import platform
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -102,17 +102,10 @@ class MapReport(NamedTuple):
     grid: GridDrawing | None = None
 
 
-class Observer(Protocol):
-    """Is told of the progress of a run. It must neither raise nor wait: the run would do so too."""
-
-    def begin(self, run: RunDescription) -> None:
-        """The run begins, after its directory is made."""
-
-    def update(self, steps: Sequence[StepReport], map: MapReport | None) -> None:
-        """Steps were mapped; the map is reported at the end of a chunk."""
-
-    def finish(self, map: MapReport) -> None:
-        """The run has ended; `path` is the final trajectory."""
+Observer = Callable[[RunDescription | tuple[Sequence[StepReport], MapReport | None] | MapReport], None]
+"""Is told of a run: its description when its directory is made; the steps of each chunk, with the map at its
+end; and the map when it has ended, with the final trajectory as `path`. It must neither raise nor wait: the
+run would do so too."""
 
 
 CHECKPOINT_EVERY, CHECKPOINT_SHARE = 128 * CHUNK, 32
@@ -164,8 +157,8 @@ class Runner:
                 head = None
             cells = session.backend.activity(session.state) is not None
             run = RunDescription(source.name, config.backend, head, config.touch.image.tallest, cells)
-        for observer in observers:
-            observer.begin(run)
+        for observe in observers:
+            observe(run)
 
     def process(self, samples: list[Sample]) -> list[Step]:
         """Maps the next samples, up to one chunk of the session, and appends them to the files."""
@@ -216,8 +209,8 @@ class Runner:
             written.replace(file)
         self._write_manifest(status=status, steps=self.session.steps)
         made = self.session.map
-        for observer in self._observers:
-            observer.finish(self._map_report()._replace(path=made.trajectory(), grid=made.grid()))
+        for observe in self._observers:
+            observe(self._map_report()._replace(path=made.trajectory(), grid=made.grid()))
         return card
 
     def checkpoint(self) -> None:
@@ -289,8 +282,8 @@ class Runner:
                 self._drawn_at = count + count // DRAWN_SHARE
                 made = self.session.map
                 report = report._replace(path=made.online_trajectory(), grid=made.grid())
-        for observer in self._observers:
-            observer.update(reports, report)
+        for observe in self._observers:
+            observe((reports, report))
 
     def _map_report(self) -> MapReport:
         session = self.session

@@ -170,11 +170,7 @@ class Slam:
 
 
 def _match_observation(given: Observation, like: Observation) -> Observation:
-    """The observation with the dtypes of another one.
-
-    Raises:
-        InputError: an array has another shape, another kind of numbers, or numbers that are not finite.
-    """
+    """The observation with the dtypes of another one."""
     names = (*(f"odometry.{name}" for name in Odometry._fields), *Observation._fields[1:])
     values, others = (*given.odometry, *given[1:]), (*like.odometry, *like[1:])
     matched = []
@@ -191,11 +187,7 @@ def _match_observation(given: Observation, like: Observation) -> Observation:
 
 
 def _describe_whiskers(info: SourceInfo, touch: TouchConfig) -> SourceDescription:
-    """The description of whiskers, whose view shape follows from their number.
-
-    Raises:
-        InputError: there are no whiskers, or the settings in `touch.head` do not fit the head.
-    """
+    """The description of whiskers, whose view shape follows from their number."""
     if info.planar_whiskers is not None:
         count = len(info.planar_whiskers.mounts)
         return SourceDescription((1, count, 1), count, info=info)

@@ -29,7 +29,6 @@ from ratslam.service.spikes import (
     SpikeTrains,
     cell_poses,
     draw_spikes,
-    packet_poses,
     settled_peak,
     write_spikes,
 )
@@ -80,13 +79,12 @@ def write_nwb(path: Path, recording: CellRecording, spikes: SpikeTrains, digest:
         file_create_date=EPOCH,
     )
     module = file.create_processing_module("behavior", "true pose of the robot and decoded packet")
-    packet = packet_poses(recording.shape, recording.cell_size, recording.packet)
-    torus = TORUS_FRAME.format(side=recording.shape[2] * recording.cell_size)
+    torus = TORUS_FRAME.format(side=recording.torus_sides[0])
     true = np.asarray(recording.truth, float)
     times: Any = recording.time  # the first series holds them, the others refer to it
     for names, prefix, pose, frame in (
         (TRUE_NAMES, "", true, TRUE_FRAME),
-        (PACKET_NAMES, "packet_", packet, torus),
+        (PACKET_NAMES, "packet_", recording.packet_pose, torus),
     ):
         make = pynwb.behavior.SpatialSeries
         times = position = make(

@@ -10,16 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.metrics.exm import DEFAULT_EXM
 from evaluation.metrics.metric import Finding, Metric
 from evaluation.metrics.metric_registry import METRICS, MetricEntry
-from evaluation.metrics.run_metrics import RUN_METRICS, RunArrays, RunData, run_data
+from evaluation.metrics.run_metrics import RUN_METRICS, RunArrays, run_data
 from ratslam.service.check_results import Result, Trial, Violation, check, find_parts, require, require_equal
 from tactile.base.se2 import integrate
 
 LAPS, PLACES = 3, 36
-GAP = 10
-"""Distance of the pairs of `energy_gap`, steps."""
 ENTRY, VALUES = range(2)
 """Groups of checks, in their order."""
 
@@ -60,7 +57,7 @@ class MetricTrial(Trial[MetricEntry]):
     @check(VALUES, "it computes with truth", "a scorecard holds numbers")
     def computes_with_truth(self) -> str:
         what = "a run with truth"
-        result = self.metric.compute(_data(_synthetic_run()))
+        result = self.metric.compute(run_data(_synthetic_run()))
         require(result is not None, f"None for {what}", "a Finding; None means that there is no truth")
         found = _require_finding(result, what)
         self.metric.quantity(found)
@@ -68,7 +65,7 @@ class MetricTrial(Trial[MetricEntry]):
 
     @check(VALUES, "it does without truth", "most recordings have none")
     def computes_without_truth(self) -> str:
-        result = self.metric.compute(_data(_synthetic_run()._replace(truth=None)))
+        result = self.metric.compute(run_data(_synthetic_run()._replace(truth=None)))
         if result is None:
             return "no ground truth"
         found = _require_finding(result, "a run without truth")
@@ -92,26 +89,22 @@ class MetricTrial(Trial[MetricEntry]):
             "a run of one step": run._replace(**first),
         }
         for what, one in rare.items():
-            result = self.metric.compute(_data(one))
+            result = self.metric.compute(run_data(one))
             if result is not None:
                 _require_finding(result, what)
 
     @check(VALUES, "it does not change the run", "later metrics would see other arrays")
     def changes_no_run(self) -> None:
-        data = _data(_synthetic_run())
+        data = run_data(_synthetic_run())
         before = copy.deepcopy(data)
         self.metric.compute(data)
         require_equal(before, data, "the run before and after `compute`")
 
     @check(VALUES, "it is deterministic", "a score could not be reproduced")
     def is_deterministic(self) -> None:
-        first = self.metric.compute(_data(_synthetic_run()))
-        second = self.entry.build(self.settings).compute(_data(_synthetic_run()))
+        first = self.metric.compute(run_data(_synthetic_run()))
+        second = self.entry.build(self.settings).compute(run_data(_synthetic_run()))
         require_equal(first, second, "the findings of one run computed twice")
-
-
-def _data(run: RunArrays) -> RunData:
-    return run_data(run, DEFAULT_EXM, None, GAP)
 
 
 def _synthetic_run() -> RunArrays:

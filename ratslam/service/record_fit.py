@@ -277,11 +277,7 @@ FOLDS, BLOCK = 3, 10
 
 
 def _fit_stage(source: PluginConfig) -> Rig:
-    """How well signals of a whisker on a stage follow from the place of the touch, on rows held out.
-
-    Raises:
-        InputError: the record cannot be read.
-    """
+    """How well signals of a whisker on a stage follow from the place of the touch, on rows held out."""
     settings = read_settings(real_whiskers.StageConfig, source.settings, "source.settings")
     position, signal, base = real_whiskers.read_stage_calibration(settings.file)
     # Root mean square errors over the channels of each row held out: of the map, and of the mean signal.

@@ -80,11 +80,7 @@ and of its ranges, NaN and None without any, the largest (m) and the field of vi
 
 
 def _describe_file(path: Path) -> _Found:
-    """What a recording holds.
-
-    Raises:
-        InputError: it is missing, damaged, or of no known format.
-    """
+    """What a recording holds."""
     from robot.recordings.mcap_reader import is_foreign
     from robot.recordings.npz_trace import array_shapes
 
@@ -272,11 +268,7 @@ def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
 
 
 def _alike(sections: dict[str, Any], like: SavedMap) -> dict[str, Any]:
-    """The sections with all settings in which the view, the cells or the method of a map differ from theirs.
-
-    Raises:
-        InputError: the recording is of another sensor.
-    """
+    """The sections with all settings in which view, cells or method of a map differ from theirs."""
     name = f"doctor --like {like.path}"
     document = override(parse(dump_data(sections), name), [f"backend={like.config.backend}"])
     given = validate(document, RunConfig)

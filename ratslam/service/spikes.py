@@ -42,12 +42,7 @@ def cell_poses(shape: tuple[int, int, int], cell_size: float, cell: np.ndarray) 
     """
     _check_cells(shape, cell)
     heading, y, x = np.unravel_index(np.asarray(cell, np.int64), shape)
-    return packet_poses(shape, cell_size, np.stack([x, y, heading], axis=-1))
-
-
-def packet_poses(shape: tuple[int, int, int], cell_size: float, packet: np.ndarray) -> np.ndarray:
-    """[..., 3] poses on the torus (m, m, rad) of positions [..., 3] over x, y, heading in cells."""
-    return np.asarray(packet, np.float64) * [cell_size, cell_size, 2 * np.pi / shape[0]]
+    return np.stack([x, y, heading], axis=-1) * [cell_size, cell_size, 2 * np.pi / shape[0]]
 
 
 def _check_cells(shape: tuple[int, int, int], cell: np.ndarray) -> None:
@@ -162,7 +157,7 @@ def write_spikes(path: str | Path, spikes: SpikeTrains) -> None:
         "times": np.concatenate([np.zeros(0), *spikes.times]),
         "interval": np.array([spikes.start, spikes.stop]),
     }
-    with Path(path).open("wb") as file:
+    with Path(path).open("wb") as file:  # with a path, NumPy would add a suffix to .NPZ
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
-from ratslam.runs.runner import MapReport, Observer, RunDescription, StepReport
+from ratslam.runs.runner import Observer
 from robot.drivers.processes import put_last
 from robot.emulators.listening import is_loopback
 from tactile.base.errors import InputError, tell
@@ -64,16 +64,7 @@ class Viewer(AbstractContextManager["Viewer"]):
         self._writer = Thread(target=self._write, daemon=True, name="to viewer")
         self._writer.start()
 
-    def begin(self, run: RunDescription) -> None:
-        self._offer(run)
-
-    def update(self, steps: Sequence[StepReport], map: MapReport | None) -> None:
-        self._offer((tuple(steps), map))
-
-    def finish(self, map: MapReport) -> None:
-        self._offer(map)
-
-    def _offer(self, message: Any) -> None:
+    def __call__(self, message: Any) -> None:
         self.offered += 1
         try:
             self._queue.put_nowait(message)
@@ -173,11 +164,7 @@ def prepare_target(text: str) -> str:
 
 
 def _split_address(text: str) -> tuple[str, int]:
-    """Host and port of a loopback address.
-
-    Raises:
-        InputError: it is not one.
-    """
+    """Host and port of a loopback address."""
     host, _, port = text.rpartition(":")
     number = int(port) if port.isdecimal() else 0
     if not is_loopback(host) or not 0 < number < 1 << 16:

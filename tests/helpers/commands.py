@@ -17,6 +17,12 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object, code: int = 0) 
     return capsys.readouterr().out
 
 
+def contents(folder: Path, *without: str) -> dict[str, bytes]:
+    """The files in a folder and below it, but those of some names."""
+    files = [file for file in folder.rglob("*") if file.is_file() and file.name not in without]
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     """The errors of a command that ends with code 2, each a line without its beginning."""
     capsys.readouterr()

@@ -164,11 +164,7 @@ def _check_sources(document: Document, assignments: Sequence[str]) -> None:
 
 
 def _check_plugins(document: Document, config: RunConfig) -> None:
-    """Checks the names and settings of all registered parts in a configuration.
-
-    Raises:
-        InputErrors: all errors, each with file, line, column and key path.
-    """
+    """Checks the names and settings of all registered parts in a configuration."""
     from ratslam.methods.method_registry import BACKENDS  # loads JAX
 
     # Of each part: the path of its name, that of its settings, where it is registered, and its name.

@@ -418,7 +418,8 @@ def read_configuration(path: Path, assignments: Sequence[str] = ()) -> Document:
         assignments: as for `load`.
 
     Raises:
-        InputError: a file cannot be read or is not strict YAML; with file, line and column.
+        InputError: a file cannot be read or is not strict YAML, or an included one includes others; with
+            file, line and column.
     """
     return _merge_includes(with_moved_settings(load(path, assignments)), path.parent)
 
@@ -471,9 +472,6 @@ def _merge_includes(document: Document, folder: Path) -> Document:
 
     Args:
         folder: in which relative paths start, if not given by `--set`.
-
-    Raises:
-        InputError: a file cannot be read, is not strict YAML, or includes others.
     """
     names = document.data.get(INCLUDE)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):

@@ -49,8 +49,6 @@ def test_without_files_there_are_no_walls_closures_and_views_and_scorecards_read
     (tmp_path / "scorecard.json").write_text("{}")
     with pytest.raises(InputError, match="scorecard"):
         read_scorecard(tmp_path)
-    with pytest.raises(InputError, match="no such file"):
-        read_scorecard(tmp_path / "elsewhere")
 
 
 def test_accepted_closures_are_read(tmp_path):
@@ -114,18 +112,19 @@ VIEWS = run_reader.WhiskerViews(
 @given(arrays(np.float64, (4, 3, 6), elements=st.floats(0, 1)))
 def test_whisker_images_read_back_within_one_grey_level_with_equal_bytes(tmp_path_factory, view):
     folder = tmp_path_factory.mktemp("images")
-    for name in "ab":
+    for name in ("a.npz", "b.npz"):
         run_reader.write_whisker_views(folder / name, VIEWS._replace(view=view))
-    assert (folder / "a").read_bytes() == (folder / "b").read_bytes()
-    found = run_reader.read_whisker_views(folder / "a")
+    assert (folder / "a.npz").read_bytes() == (folder / "b.npz").read_bytes()
+    found = run_reader.read_whisker_views(folder / "a.npz")
     assert np.abs(found.view - view).max() <= 1 / 255
     assert np.array_equal(found.view > 0, view > 0)
     for written, read in zip(VIEWS[1:], found[1:], strict=True):
         assert np.array_equal(written, read)
 
 
+MAP = OccupancyGrid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.1]]), np.array([-1.25, 0.5]), 0.05)
+"""Two rows, the first one below the second."""
 PROBABILITIES = arrays(np.float64, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.floats(0, 1))
-GRID = OccupancyGrid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.7]]), np.array([-1.25, 0.5]), 0.05)
 
 
 @given(PROBABILITIES, st.floats(-1e3, 1e3), st.floats(1e-6, 2))
@@ -139,7 +138,7 @@ def test_a_grid_file_keeps_every_digit(tmp_path_factory, probability, x, cell):
 
 
 @pytest.mark.parametrize(("read", "whole", "odd"), [
-    (read_grid, GRID, {"probability": np.full((2, 2), 7.0)}),
+    (read_grid, MAP, {"probability": np.full((2, 2), 7.0)}),
     (run_reader.read_whisker_views, VIEWS, {"length": np.zeros(2)}),
 ])  # fmt: skip
 def test_spoilt_and_foreign_archives_are_refused(tmp_path, read, whole, odd):
@@ -156,8 +155,6 @@ def test_spoilt_and_foreign_archives_are_refused(tmp_path, read, whole, odd):
 
 
 places = st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)).map(np.array)
-MAP = OccupancyGrid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.1]]), np.array([-1.25, 0.5]), 0.05)
-"""Two rows, the first one below the second."""
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from ratslam.runs.saved_map import read_map
 from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from tactile.base.types import Odometry, observation
-from tests.helpers.commands import ROOT, SQUARE, refused, said
+from tests.helpers.commands import ROOT, SQUARE, contents, refused, said
 from tests.helpers.square_run import copy_square_run
 from tests.ratslam.places.test_route import TRAVEL, line_map, travel_graph
 from tests.ratslam.runs.test_map_formats import FILES
@@ -75,9 +75,9 @@ def test_info_says_what_is_in_a_map_and_an_undone_sequence_is_gone(capsys, tmp_p
 def test_the_files_of_a_run_follow_a_map_that_is_corrected_in_it(capsys, tmp_path: Path) -> None:
     run = copy_square_run(tmp_path / "run")
     sequence = info(capsys, run)["accepted_sequences"][-1]["sequence"]
-    before = {file.name: file.read_bytes() for file in run.iterdir()}
+    before = contents(run)
     said(capsys, "map", "undo", run, sequence, "-o", tmp_path / "undone.npz")
-    assert {file.name: file.read_bytes() for file in run.iterdir()} == before
+    assert contents(run) == before
     said(capsys, "map", "undo", run, sequence)
     made = read_map(run).open_session().map
     assert np.array_equal(ratslam.Result(run).trajectory[:, :2], made.trajectory()[:, :2])

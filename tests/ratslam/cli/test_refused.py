@@ -22,7 +22,7 @@ from ratslam.cli import build_parser
 from ratslam.cli.common import CommandParser, Commands
 from ratslam.runs.map_care import map_info
 from ratslam.runs.saved_map import read_map
-from tests.helpers.commands import ROOT, SQUARE, refused, said
+from tests.helpers.commands import ROOT, SQUARE, contents, refused, said
 from tests.helpers.square_run import copy_square_run
 
 FILE = ROOT / "tests" / "data" / "maps" / "ratslam-map-1.npz"
@@ -53,10 +53,6 @@ def more_arguments(words: Words, value: str = "1") -> list[str]:
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     return copy_square_run(tmp_path / "run")
-
-
-def contents(folder: Path) -> dict[Path, bytes]:
-    return {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
 @contextmanager
@@ -266,8 +262,8 @@ REFUSED = {
     "export run -o a.npz --peak-rate inf": "--peak-rate above 0",
     "export run -o a.npz --spike-seed -1": "--spike-seed from 0",
     "check source file --samples 0": "--samples positive",
-    "emulate create live_maze": "live: that of an arm",
-    "emulate head live_create": "live: that of a Create",
+    "emulate create live_maze": "live: that of an arm `live_create`",
+    "emulate head live_create": "live: that of a Create `live_maze`",
     "localise empty SQUARE": "map.npz: no such file",
     "runn": "'runn'",
 }  # fmt: skip

@@ -23,7 +23,7 @@ from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import load_config
 from tactile.base import files
 from tactile.base.errors import InputError
-from tests.helpers.commands import ROOT, refused, said
+from tests.helpers.commands import ROOT, contents, refused, said
 from tests.helpers.square_run import copy_square_run
 
 
@@ -95,9 +95,8 @@ def test_a_second_interrupt_is_not_lost_in_the_garbage_collector():
         collect()
 
 
-def check_killed_run(corridor, directory):
-    """A killed run has a prefix of the lines, and can be scored from its first step on; how many."""
-    _, whole = corridor
+def check_killed_run(whole, directory):
+    """A killed run has a prefix of the lines, and can be scored from its first step on."""
     for name in ("steps.csv", "online.tum", "odometry.tum", "truth.tum"):
         if (directory / name).exists():
             written = (directory / name).read_bytes()
@@ -106,7 +105,6 @@ def check_killed_run(corridor, directory):
     code = main(["score", str(directory)])
     rows = (directory / "steps.csv").read_text().count("\n") if (directory / "steps.csv").exists() else 0
     assert code == (0 if rows > 1 else 2)
-    return rows
 
 
 def kill_and_continue(config, whole, directory, moment):
@@ -118,7 +116,7 @@ def kill_and_continue(config, whole, directory, moment):
         time.sleep(moment - 1)
     process.kill()
     process.communicate()
-    check_killed_run((config, whole), killed)
+    check_killed_run(whole, killed)
     (killed / ".1.map.npz").write_text("cut")  # as of a kill while a checkpoint is written
     status = json.loads((killed / "manifest.json").read_text())["status"]
     code = main(["run", str(config), "--continue", str(killed), "-o", str(rest)])
@@ -185,10 +183,6 @@ OLD, NEW = dict.fromkeys(("a", "b", "gone"), "old"), dict.fromkeys(("a", "b", "m
 
 def seen(folder: Path) -> dict[str, str]:
     return {file.name: file.read_text() for file in folder.iterdir() if file.is_file()}
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
 def test_a_change_that_is_killed_at_any_moment_is_none_or_can_be_completed(tmp_path: Path) -> None:
@@ -260,15 +254,15 @@ def run(tmp_path: Path) -> tuple[Path, int]:
 def test_a_fault_before_the_last_file_is_made_changes_nothing(run, capsys, monkeypatch) -> None:
     """A file that is lost or spoilt is one error; Ctrl-C is none."""
     path, sequence = run
-    whole = content(path)
+    whole = contents(path)
     faults = {"steps.csv": None, "online.tum": b"1 2 damaged\n3 4\n", "walls.csv": b"west\nx\n"}
     for name, spoilt in faults.items():
         (path / name).unlink(missing_ok=True)
         if spoilt is not None:
             (path / name).write_bytes(spoilt)
-        before = content(path)
+        before = contents(path)
         assert refused(capsys, "map", "undo", path, sequence).startswith(str(path / name))
-        assert content(path) == before
+        assert contents(path) == before
         (path / name).unlink(missing_ok=True)
         if name in whole:
             (path / name).write_bytes(whole[name])
@@ -279,7 +273,7 @@ def test_a_fault_before_the_last_file_is_made_changes_nothing(run, capsys, monke
     monkeypatch.setattr("ratslam.runs.map_results.plot_writers", interrupt)
     with pytest.raises(KeyboardInterrupt):
         undo_sequence(read_map(path), sequence, path / "map.npz")
-    assert content(path) == whole
+    assert contents(path) == whole
 
 
 def test_an_undo_that_was_killed_amid_its_files_is_completed_by_a_repeat(run, tmp_path, capsys, monkeypatch):
@@ -292,4 +286,4 @@ def test_an_undo_that_was_killed_amid_its_files_is_completed_by_a_repeat(run, tm
     assert main(["map", "info", str(path)]) == 0
     assert f"repeat `ratslam map undo {path} {sequence}`" in capsys.readouterr().err
     assert "is complete" in said(capsys, "map", "undo", path, sequence)
-    assert content(path) == content(whole)
+    assert contents(path) == contents(whole)

@@ -118,8 +118,6 @@ SLOW = {"create": {"port": "/dev/ttyNONE", "speed": 0.04}}
         (LIVE, GRID, ["/dev/ttyNONE", "no such port"]),
         (LIVE, GRID | {"live": SLOW}, ["live.create.plan.behaviour", "0.05 m/s", "0.04"]),
         ("live FILE -o FILE/run", GRID, ["config.yaml: not a folder"]),  # before the devices are opened
-        ("emulate create live_maze", GRID, ["that of an arm", "`live_create`"]),
-        ("emulate head live_create", GRID, ["that of a Create", "`live_maze`"]),
         ("emulate create live_create --set live.create.port=/dev/ttyUSB0", GRID, ["live.create.port"]),
         ("emulate create live_create --set live.head.address=usb", GRID, ["live.head.address"]),
     ],

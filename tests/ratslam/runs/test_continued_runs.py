@@ -13,7 +13,6 @@ import pytest
 import ratslam
 import ratslam.runs.runner
 from ratslam.core.session import Session
-from ratslam.methods.map_file import digest_of
 from ratslam.runs.build_session import build_session
 from ratslam.runs.continuation import resume_session
 from ratslam.runs.run import process_source
@@ -24,6 +23,7 @@ from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.in_memory import InMemorySource
 from robot.sources.source import Sample
+from tests.ratslam.runs.test_saved_map import rewritten
 
 TRACE = Path(__file__).parents[2] / "golden" / "a_square3.npz"
 METHOD = {
@@ -147,13 +147,8 @@ def test_a_killed_run_goes_on_from_its_checkpoint(monday, expected, tmp_path, mo
     assert_same(run(second(), tmp_path / "rest", tmp_path / "killed"), expected)
 
 
-def of_first_format(file: Path, path: Path) -> Path:
-    """A copy of a map file in the format that does not tell which steps are of the last recording."""
-    with np.load(file) as archive:
-        arrays = {name: archive[name] for name in archive.files if name != "earlier"}
-    arrays["format"] = np.array("ratslam-map-1")
-    np.savez(path, **arrays | {"sha256": np.array(digest_of(arrays))})
-    return path
+of_first_format = partial(rewritten, drop=("earlier",), format="ratslam-map-1")
+"""A copy of a map file in the format that does not tell which steps are of the last recording."""
 
 
 def test_a_map_in_the_first_format_goes_on_if_it_tells_its_samples(expected, tmp_path):

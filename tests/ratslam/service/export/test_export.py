@@ -240,10 +240,8 @@ def test_experiences_are_read_by_networkx_and_equal_runs_give_equal_bytes(square
     assert (tmp_path / "a.graphml").read_bytes() == (tmp_path / "b.graphml").read_bytes()
 
 
-def test_no_run_times_beyond_ros_stamps_and_a_missing_library_are_refused(copy, tmp_path, monkeypatch):
+def test_times_beyond_ros_stamps_and_a_missing_library_are_refused(copy, tmp_path, monkeypatch):
     lines = (copy / "online.tum").read_text().splitlines(keepends=True)
-    with pytest.raises(InputError, match=r"nothing: no such folder"):
-        export_run(tmp_path / "nothing", tmp_path / "a.mcap")
     for row, time in ((0, "-1.0"), (-1, "2147483648.0")):
         changed = lines.copy()
         changed[row] = " ".join([time, *lines[row].split(" ")[1:]])

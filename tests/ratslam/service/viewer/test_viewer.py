@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from ratslam.service.viewer_process import POINTS, Drawing, open_recording, whis
 from tactile.base.errors import InputError
 from tactile.base.types import Odometry, observation
 from tactile.whisker_geometry import HeadConfig, shaft_points, ur10_head
-from tests.helpers.commands import SQUARE
+from tests.helpers.commands import SQUARE, contents
 from tests.helpers.live import until
 from tests.helpers.square_run import copy_square_run
 
@@ -51,10 +50,6 @@ class Shown:
         return dict(sorted(self.rows(entity, component), key=lambda row: row[0]))
 
 
-def files_of(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "timing.csv"}
-
-
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
     """A run without a view."""
@@ -71,7 +66,7 @@ def viewed(tmp_path_factory):
 
 def test_a_view_in_a_file_changes_no_result_and_shows_every_step(plain, viewed):
     directory, shown = viewed
-    assert files_of(plain) == files_of(directory)
+    assert contents(plain, "timing.csv") == contents(directory, "timing.csv")
     done = read_run(directory)
     steps, last = len(done.time), len(done.time) - 1
     places = shown("/world/robot", "Transform3D:translation")
@@ -220,21 +215,21 @@ def test_a_viewer_killed_in_the_middle_changes_no_result(plain, tmp_path, capfd)
     quiet = subprocess.DEVNULL
     with subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True) as server:
 
-        def kill(steps, map):
-            if steps is None or (steps[-1].number >= 160 and server.poll() is None):
+        def kill(message):
+            passed = isinstance(message, tuple) and len(message) == 2 and message[0][-1].number >= 160
+            if message is None or (passed and server.poll() is None):
                 os.killpg(server.pid, signal.SIGKILL)  # it has started the viewer as a process of its own
                 server.wait()
 
-        killing = SimpleNamespace(begin=lambda run: None, update=kill, finish=lambda map: None)
         try:
             until(lambda: answers(port), "the server")
             with Viewer(prepare_target(f"127.0.0.1:{port}")) as viewer:
-                run(load_config(SQUARE), tmp_path / "run", observers=[viewer, killing])
+                run(load_config(SQUARE), tmp_path / "run", observers=[viewer, kill])
             assert server.poll() is not None
         finally:
             if server.poll() is None:
-                kill(None, None)
-    assert files_of(plain) == files_of(tmp_path / "run")
+                kill(None)
+    assert contents(plain, "timing.csv") == contents(tmp_path / "run", "timing.csv")
     assert f"127.0.0.1:{port} is gone" in one_warning(capfd)
 
 
@@ -246,7 +241,7 @@ def test_a_viewer_that_accepts_and_never_reads_changes_no_result(plain, tmp_path
         address = f"127.0.0.1:{listener.getsockname()[1]}"
         with Viewer(prepare_target(address), end=1.0) as viewer:
             run(load_config(SQUARE), tmp_path / "run", observers=[viewer])
-    assert files_of(plain) == files_of(tmp_path / "run")
+    assert contents(plain, "timing.csv") == contents(tmp_path / "run", "timing.csv")
     assert f"the view at {address} did not keep up" in one_warning(capfd)
 
 
@@ -265,7 +260,7 @@ ENDS = "ended early; the results are complete"
 def test_a_drawing_process_that_does_not_keep_up_is_said_once(code, end, messages, dropped, words, capfd):
     with Viewer("nowhere", end=end, command=[sys.executable, "-c", code]) as viewer:
         for _ in range(messages):
-            viewer.update((bytes(100_000),), None)
+            viewer(((bytes(100_000),), None))
     assert viewer.offered == messages
     assert viewer.dropped in dropped
     error = one_warning(capfd)
