@@ -246,32 +246,28 @@ class Calibration(NamedTuple):
     alive: np.ndarray
     rate: float
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The fields as arrays by name, for storage with a session; `from_arrays` reads them."""
-        return {name: np.asarray(value) for name, value in self._asdict().items()}
-
     def to_json(self) -> dict[str, Any]:
         """The calibration as a JSON object; infinite values are strings."""
-        return {name: _plain(array.tolist()) for name, array in self.arrays().items()}
+        return {name: _plain(np.asarray(value).tolist()) for name, value in self._asdict().items()}
 
     @classmethod
-    def from_arrays(cls, stored: Mapping[str, np.ndarray], where: str = "calibration") -> Calibration:
-        """The inverse of `arrays`.
+    def from_json(cls, stored: Mapping[str, Any]) -> Calibration:
+        """The inverse of `to_json`.
 
         Raises:
-            InputError: an array is missing or has the wrong shape.
+            InputError: a field is missing or has the wrong shape.
         """
-        lacking = [name for name in cls._fields if name not in stored]
-        if lacking:
-            raise InputError(where, f"{', '.join(lacking)} missing", "all arrays of a calibration")
-        whiskers = len(np.atleast_1d(stored["alive"]))
-        shapes: dict[str, tuple[int, ...]] = {name: (whiskers, 2) for name in ("mean", "sd", "threshold")}
-        shapes |= {"free": (whiskers,), "alive": (whiskers,), "rate": ()}
-        for name, shape in shapes.items():
-            if np.shape(stored[name]) != shape:
-                raise InputError(f"{where}.{name}", f"shape {np.shape(stored[name])}", str(shape))
-        values = {name: np.asarray(stored[name], float) for name in cls._fields[:4]}
-        return cls(**values, alive=np.asarray(stored["alive"], bool), rate=float(stored["rate"]))
+        if lacking := [name for name in cls._fields if name not in stored]:
+            raise InputError("calibration", f"{', '.join(lacking)} missing", "all fields of a calibration")
+        kinds = {name: bool if name == "alive" else float for name in cls._fields}
+        values: dict[str, Any] = {name: np.asarray(stored[name], kind) for name, kind in kinds.items()}
+        whiskers = values["alive"].size
+        for name, value in values.items():
+            by_axis = name in ("mean", "sd", "threshold")
+            shape = () if name == "rate" else (whiskers, 2) if by_axis else (whiskers,)
+            if value.shape != shape:
+                raise InputError(f"calibration.{name}", f"shape {value.shape}", str(shape))
+        return cls(**values | {"rate": float(values["rate"])})
 
 
 def calibrate(

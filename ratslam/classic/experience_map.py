@@ -292,7 +292,6 @@ class ExperienceMap(Checkpointed, Map):
         return int(self._node_of.rows[place]) if 0 <= place < len(self._node_of.rows) else -1
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self._link_of = {(int(a), int(b)): k for k, (a, b) in enumerate(self._ends.rows)}
         self._growing = None

@@ -206,9 +206,6 @@ class Genealogy(Checkpointed):
         self._pose = GrowableArray((count, 3), np.float64)
         self._weight = np.full(count, 1.0 / count)
 
-    def __len__(self) -> int:
-        return len(self._settled.rows) + len(self._pose.rows)
-
     def append(self, poses: np.ndarray, weights: np.ndarray, ancestor: np.ndarray) -> None:
         """Adds a report: poses [N, 3], normalised weights [N], and the next ancestors [N]."""
         self._pose.append(poses)

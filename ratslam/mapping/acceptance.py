@@ -212,7 +212,6 @@ class AcceptByOdds(Acceptance):
         return found
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self._scan.clear()
 

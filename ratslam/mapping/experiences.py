@@ -135,7 +135,6 @@ class Experiences(Checkpointed):
         return graph
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self._link_of = {(a, b): k for k, (a, b, _) in enumerate(self._link.rows.tolist())}
 

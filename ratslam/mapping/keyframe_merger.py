@@ -160,9 +160,7 @@ def archive_merge(merge: MergedRows, state: MapState, archive: Archive) -> None:
     """The archive follows a merge of keyframes of the map, which has not changed yet."""
     pairs = state.confirmed_pairs()[len(archive.pairs.rows) :]
     if not archive.begun:
-        archive.state.restore(state.arrays())
-        archive.row.replace(np.arange(state.count))
-        archive.offset.replace(np.zeros((state.count, 3)))
+        archive.begin(state)
     gone = np.isin(pairs[:, 0], state.taken.rows[~merge.is_kept()])
     archive.pairs.replace(np.concatenate([archive.pairs.rows, pairs[gone]])[-PAIRS:])
     row, offset = archive.row.rows, archive.offset.rows

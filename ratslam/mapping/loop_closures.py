@@ -108,6 +108,15 @@ class ClosureLog(Checkpointed):
         for k, candidate in enumerate(candidates):
             self.judge(self.add(candidate, k > 0), Verdict.ACCEPTED)
 
+    def extend(self, other: ClosureLog, frames: int) -> None:
+        """Adds the candidates and sequences of another map, whose keyframes follow `frames` ones of this."""
+        candidate, arrays = other._candidate.rows.copy(), other._growable_arrays()
+        candidate[:, :2] += frames
+        candidate[candidate[:, 3] >= 0, 3] += self.sequences
+        for name, array in self._growable_arrays().items():
+            array.extend(candidate if name == "candidate" else arrays[name].rows)
+        self._lines = self._begun = None
+
     def members(self, sequence: int) -> np.ndarray:
         """[n, 4] keyframe, match, shift, sequence of the candidates of one sequence."""
         rows = self._candidate.rows[self._among(sequence)]
@@ -357,7 +366,6 @@ class ClosureLog(Checkpointed):
         return np.concatenate(parts, axis=1)
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self._lines = self._begun = None
 

@@ -30,6 +30,7 @@ from ratslam.mapping.optimizer import (
     MapFit,
     MapProblem,
     OdometryChain,
+    OdometryLinks,
     solve,
 )
 from ratslam.mapping.pieces import NOTHING_JOINED, Place, number_pieces, piece_start, placed_pieces
@@ -194,6 +195,22 @@ class MapState(Checkpointed):
         self.pose.replace(poses)
         self.cut.replace(cut)
         self.links = NO_LINKS
+
+    def extend(self, other: MapState, motion: np.ndarray, links: OdometryLinks, taken: int) -> None:
+        """Adds the keyframes and closures of another map as a piece of their own.
+
+        Args:
+            motion: [n, 3] into its keyframes. links: its own, with the numbers that its keyframes get here.
+                taken: number of keyframes ever taken here.
+        """
+        first, cut = self.count, other.cut.rows
+        shown = np.where((cut >= 0) & (cut < INTERRUPTED), cut + self.log.sequences, cut)
+        moved = {"motion": motion, "cut": shown, "taken": other.taken.rows + taken}
+        self.log.extend(other.log, first)
+        for name, array in self._growable_arrays().items():
+            array.extend(moved[name] if name in moved else getattr(other, name).rows)
+        self.begins.rows[first] = True
+        self.links = OdometryLinks(*map(np.concatenate, zip(self.links, links, strict=True)))
 
     def take(self, rows: np.ndarray) -> None:
         """Reduces all arrays to the keyframes `rows` [n]; links are not touched."""
@@ -495,7 +512,6 @@ class MapState(Checkpointed):
         return {n if n.partition("/")[0] in own else f"graph/{n}": values for n, values in arrays.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`."""
         super().restore(arrays | with_prefix(arrays, "graph/"))
 
     def _parts(self) -> list[str]:
@@ -524,6 +540,12 @@ class Archive(Checkpointed):
     def begun(self) -> bool:
         """Whether keyframes were merged."""
         return len(self.row.rows) > 0
+
+    def begin(self, state: MapState) -> None:
+        """Takes over a map of which no keyframe is merged yet."""
+        self.state.restore(state.arrays())
+        self.row.replace(np.arange(state.count))
+        self.offset.replace(np.zeros((state.count, 3)))
 
     def follow(self, solution: MapState) -> None:
         """Takes over a solution of the map."""

@@ -127,7 +127,6 @@ class SectorFan(Checkpointed):
         return np.stack([offset[k] + fine * (offset[1] - offset[0]), trust, length], axis=1)
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self._pairs = _no_pairs()
 

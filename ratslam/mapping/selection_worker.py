@@ -64,7 +64,6 @@ class DelayedJob(Checkpointed, Generic[Result]):
         return arrays
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Replaces the whole state by that of `arrays`."""
         super().restore(arrays)
         self.result = None
         if self._due >= 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,8 @@ class Travel(NamedTuple):
 
 
 NO_TRAVEL = Travel(np.zeros(3), 0.0, 0.0)
+Bend = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Motions [n, 3] over distances [n], m, as another calibration takes them."""
 
 
 class StepRecord(Checkpointed):
@@ -66,7 +69,26 @@ class StepRecord(Checkpointed):
 
     def settle(self, count: int) -> None:
         """The steps that lead to no keyframe of the `count` taken belong to the newest one."""
-        self._frame.rows[:] = settled(self._frame.rows, count)
+        frame = self._frame.rows
+        frame[:] = np.where(frame <= leading_to(count), count - 1, frame)
+
+    def extend(self, other: StepRecord, count: int, start: np.ndarray, bend: Bend) -> None:
+        """Adds the steps of another map, whose keyframes follow `count` of this one; those before its first
+        keyframe, at `start` [3], lead to that.
+
+        Args:
+            bend: odometry of the other map to that of this one.
+        """
+        self.settle(count)
+        frame, motion = other._frame.rows, other._motion.rows.copy()
+        early = frame == -1
+        motion[early, :3] = between(start, motion[early, :3])
+        motion[:, :3] = np.where(early[:, None], motion[:, :3], bend(motion[:, :3], motion[:, 3]))
+        motion[early, 3] = 0.0
+        number = np.where(frame < -1, frame - count, frame + count)
+        self._frame.extend(np.where(early, leading_to(count), number))
+        self._motion.extend(motion)
+        self._odometry.extend(other.odometry)
 
     def take(self, number: np.ndarray) -> np.ndarray:
         """Reduces the record to the steps of keyframes that remain; steps before the first keyframe remain
@@ -115,11 +137,6 @@ class StepRecord(Checkpointed):
         """[T] the keyframe of each step, of `count` keyframes taken."""
         frame = self._frame.rows
         return np.minimum(np.where(frame < -1, leading_to(frame), np.maximum(frame, 0)), count - 1)
-
-
-def settled(frame: np.ndarray, count: int) -> np.ndarray:
-    """[T] numbers of steps; those that lead to no keyframe of `count` taken ones have that of the newest."""
-    return np.where(frame <= leading_to(count), count - 1, frame)
 
 
 def leading_to(frame: Any) -> Any:

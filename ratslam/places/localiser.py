@@ -28,7 +28,6 @@ from ratslam.mapping.ground import (
     learn_gain_odds,
 )
 from ratslam.mapping.map import KeyframeMap
-from ratslam.mapping.map_state import MapState
 from ratslam.mapping.step_record import NO_TRAVEL
 from ratslam.places.hypotheses import LONGEST, Hypotheses, SessionViews
 from ratslam.places.placement import NOTHING_RECALLED
@@ -63,11 +62,6 @@ class Place(NamedTuple):
     frames: np.ndarray
     ground: Ground
     odds: GainOdds
-
-    @property
-    def state(self) -> MapState:
-        """The keyframes that are not merged."""
-        return self.map.state
 
 
 class Visits(NamedTuple):
@@ -185,7 +179,7 @@ class Localiser(LocalisedMap):
 
     def _moved(self) -> Motion:
         """The motion since the newest keyframe without the systematic errors that the map knows."""
-        graph, (motion, length, turn) = self.place.state, self._travel
+        graph, (motion, length, turn) = self.place.map.state, self._travel
         variance = graph.odometry_variance(length, turn)
         variance[2] *= HEADING_NOISE * graph.heading_noise.further_factor
         return Motion(graph.correct(motion, length), variance)

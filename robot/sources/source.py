@@ -28,10 +28,8 @@ def _read_calibration(value: Any) -> Calibration | None:
     if value is None or isinstance(value, Calibration):
         return value
     try:
-        kinds = {name: bool if name == "alive" else float for name in value}
-        arrays = {name: np.asarray(array, kinds[name]) for name, array in value.items()}
-        return Calibration.from_arrays(arrays)
-    except (AttributeError, TypeError) as error:
+        return Calibration.from_json(value)
+    except TypeError as error:
         raise ValueError(f"not a calibration: {error}") from None
 
 

@@ -10,7 +10,7 @@ angles at which a whisker was never the first to touch in training, and detects 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple, Self
 
@@ -28,8 +28,6 @@ FILE_VERSION = 1
 TEMPLATES = "templates"
 """Name of the templates in errors."""
 TRAIN_HINT = "make one with `python -m ratslam reproduce templates`"
-ANGLE_TOLERANCE = np.radians(0.5)
-"""Largest difference between the angle of a drive and that of its template, rad."""
 SQUARE_MEDIAN = 0.4549
 """Median of the square of a standard normal variable."""
 WallAngle = Annotated[float, Field(gt=0, lt=180)]
@@ -80,25 +78,6 @@ class TemplateTraining(Settings):
         return round(self.duration * self.rate)
 
 
-class TrainingDrive(NamedTuple):
-    """One drive into a wall.
-
-    Attributes:
-        angle: the wall's direction in base_link, rad. repeat: number of the drive at this angle.
-        strain: [T, W, 2] raw strain from first contact on. rate: samples per second.
-    """
-
-    angle: float
-    repeat: int
-    strain: np.ndarray
-    rate: float
-
-    @classmethod
-    def of_report(cls, angle: float, repeat: int, report: Report) -> TrainingDrive:
-        """The drive recorded in a report."""
-        return cls(angle, repeat, report.strain, strain_sample_rate(report))
-
-
 class StrainTemplates(NamedTuple):
     """Trained templates of A wall directions, T samples and W whiskers.
 
@@ -142,14 +121,13 @@ class TemplateMatch(NamedTuple):
     """Result of template matching.
 
     Attributes:
-        error: [A] error of each template, eq. 5. winner: index of the best one. angle: its direction, rad.
+        error: [A] error of each template, eq. 5. angle: direction of the best one, rad.
         refined: direction at the minimum of the parabola through the errors of it and its neighbours, rad.
         relative: error of the best one over the mean square of the strain: near 0 for straight walls, near 1
             for other objects.
     """
 
     error: np.ndarray
-    winner: int
     angle: float
     refined: float
     relative: float
@@ -180,45 +158,40 @@ def filter_strain(training: TemplateTraining, strain: np.ndarray) -> np.ndarray:
     return windows.mean(axis=-1).reshape(np.shape(strain))
 
 
-def train_templates(
-    drives: Iterable[TrainingDrive], training: TemplateTraining | None = None
-) -> StrainTemplates:
+def train_templates(training: TemplateTraining, drives: Sequence[np.ndarray]) -> StrainTemplates:
     """Trains templates from drives into walls.
 
+    Args:
+        drives: of each [T, W, 2] the raw strain from first contact on; `training.repeats` at the first of the
+            training's angles, then at the next, ...
+
     Raises:
-        InputError: too few drives at an angle, or a drive at another angle, of another sample rate or count
-            of whiskers, too short, or with NaN samples.
+        InputError: a drive is too short, or has NaN samples.
     """
-    training, drives = training or TemplateTraining(), list(drives)
-    angles = training.angles
-    _check(training, drives)
-    given = np.array([drive.angle for drive in drives])
-    near = np.abs(given[:, None] - angles) < ANGLE_TOLERANCE
-    count = near.sum(axis=0)
-    if (count < training.repeats).any():
-        less = np.flatnonzero(count < training.repeats)
-        few = ", ".join(f"{count[k]} at {np.degrees(angles[k]):.3g} degrees" for k in less)
-        where = f"{training.repeats} at each angle"
-        raise InputError(TEMPLATES, f"too few drives: {few}", where, "add drives")
-    filtered = [filter_strain(training, drive.strain[: training.samples]) for drive in drives]
-    sets = [np.stack([filtered[k] for k in np.flatnonzero(at)]) for at in near.T]
+    for number, strain in enumerate(drives):
+        at, repeat = divmod(number, training.repeats)
+        where = f"{TEMPLATES}: drive {repeat} at {np.degrees(training.angles[at]):.4g} degrees"
+        if len(strain) < training.samples:
+            found = f"{len(strain) / training.rate:.3g} s"
+            raise InputError(where, found, f"{training.duration:g} s from first contact on")
+        if not np.isfinite(strain).all():
+            raise InputError(where, "NaN samples", "finite samples", "train without this whisker")
+    filtered = np.stack([filter_strain(training, strain[: training.samples]) for strain in drives])
+    sets = filtered.reshape(-1, training.repeats, *filtered.shape[1:])
     mean = np.stack([one.mean(axis=0) for one in sets])
     # Most channels have no contact most of the time, so the median measures noise.
     parts = [((one - one.mean(axis=0)) ** 2).swapaxes(1, 2).reshape(-1, training.samples, 2) for one in sets]
-    square = np.concatenate(parts) / (1 - 1 / count.min())
-    return StrainTemplates(training, angles, mean, np.sqrt(np.median(square, axis=0) / SQUARE_MEDIAN))
+    square = np.concatenate(parts) / (1 - 1 / training.repeats)
+    spread = np.sqrt(np.median(square, axis=0) / SQUARE_MEDIAN)
+    return StrainTemplates(training, training.angles, mean, spread)
 
 
-def match_template(
-    templates: StrainTemplates, strain: np.ndarray, alive: np.ndarray | None = None
-) -> TemplateMatch:
-    """Matches filtered strain since HIT1 [N, W, 2] with the templates (eq. 5) by whiskers `alive` [W]."""
+def match_template(templates: StrainTemplates, strain: np.ndarray, alive: np.ndarray) -> TemplateMatch:
+    """Matches filtered strain since HIT1 [N, W, 2] with the templates (eq. 5) by whiskers `alive` [W], of
+    both at least one."""
     count = min(len(strain), templates.mean.shape[1])
-    use = np.ones(strain.shape[1], bool) if alive is None else np.asarray(alive, bool)
-    if not count or not use.any():
-        raise ValueError("no samples or no whiskers to match")
-    read = strain[:count, use]
-    error = ((read - templates.mean[:, :count, use]) ** 2).sum(axis=(2, 3)).mean(axis=1)
+    read = strain[:count, alive]
+    error = ((read - templates.mean[:, :count, alive]) ** 2).sum(axis=(2, 3)).mean(axis=1)
     winner = int(error.argmin())
     refined = angle = float(templates.angle[winner])
     if 0 < winner < len(error) - 1:
@@ -227,29 +200,7 @@ def match_template(
         step = templates.angle[winner + 1] - templates.angle[winner]
         refined += float(step * (below - above) / (2 * bend)) if bend > 0 else 0.0
     power = float((read**2).sum(axis=(1, 2)).mean())
-    return TemplateMatch(error, winner, angle, refined, float(error[winner] / max(power, 1e-300)))
-
-
-def _check(training: TemplateTraining, drives: list[TrainingDrive]) -> None:
-    if not drives:
-        expected = f"{training.repeats} drives at each of {len(training.angles)} angles"
-        raise InputError(TEMPLATES, "no drives", expected)
-    whiskers = np.shape(drives[0].strain)[1:2]
-    for drive in drives:
-        where = f"{TEMPLATES}: drive {drive.repeat} at {np.degrees(drive.angle):.4g} degrees"
-        strain = np.asarray(drive.strain)
-        if strain.ndim != 3 or strain.shape[1:] != (*whiskers, 2):
-            raise InputError(where, f"strain of shape {strain.shape}", f"[T, {whiskers[0]}, 2]")
-        if abs(drive.rate - training.rate) > 1e-3 * training.rate:
-            raise InputError(where, f"{drive.rate:.5g} samples per second", f"{training.rate:g}")
-        if len(strain) < training.samples:
-            found = f"{len(strain) / training.rate:.3g} s"
-            raise InputError(where, found, f"{training.duration:g} s from first contact on")
-        if not np.isfinite(strain).all():
-            raise InputError(where, "NaN samples", "finite samples", "leave this drive out")
-        if np.abs(drive.angle - training.angles).min() >= ANGLE_TOLERANCE:
-            angles = ", ".join(f"{angle:.4g}" for angle in np.degrees(training.angles))
-            raise InputError(where, "not one of the training angles", f"one of {angles} degrees")
+    return TemplateMatch(error, angle, refined, float(error[winner] / max(power, 1e-300)))
 
 
 SAMPLE_RATE = 50.0

@@ -45,7 +45,6 @@ from tactile.base.types import Odometry, Report, StepEnd
 from tactile.wall_estimation.strain_templates import (
     StrainTemplates,
     TemplateTraining,
-    TrainingDrive,
     train_templates,
 )
 
@@ -184,16 +183,11 @@ def make_report(config: CreateSimulationConfig, step: _CreateStep, odometry: Odo
 
 
 def train_strain_templates(config: CreateSimulationConfig) -> StrainTemplates:
-    """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G).
-
-    Raises:
-        InputError: the training has another sample rate than the whiskers.
-    """
+    """Strain templates of the robot of a session, from its seed (Fox et al. 2012, II-G)."""
     training = TemplateTraining(rate=config.whiskers.rate, speed=config.behaviour.slow)
     random = stream(config.seed, "templates")
     each = product(training.angles.tolist(), range(training.repeats))
-    drives = (TrainingDrive.of_report(at, k, drive_into_wall(config, at, random)) for at, k in each)
-    return train_templates(drives, training)
+    return train_templates(training, [drive_into_wall(config, at, random).strain for at, _ in each])
 
 
 MIN_DURATION = 1e-6

@@ -113,15 +113,15 @@ def test_records_that_cannot_be_used_are_refused():
 
 
 @pytest.mark.parametrize("name", Calibration._fields)
-def test_arrays_read_back_equal_and_missing_ones_and_wrong_shapes_are_refused(name):
+def test_fields_read_back_equal_and_missing_ones_and_wrong_shapes_are_refused(name):
     found = calibrate(CONFIG, record())
-    arrays = found.arrays()
-    assert np.array_equal(getattr(Calibration.from_arrays(arrays), name), getattr(found, name))
+    stored = found.to_json()
+    assert np.array_equal(getattr(Calibration.from_json(stored), name), getattr(found, name))
     with pytest.raises(InputError, match=name):
-        Calibration.from_arrays({key: value for key, value in arrays.items() if key != name})
+        Calibration.from_json({key: value for key, value in stored.items() if key != name})
     if name != "alive":
         with pytest.raises(InputError, match=name):
-            Calibration.from_arrays(arrays | {name: np.zeros(7)})
+            Calibration.from_json(stored | {name: [0.0] * 7})
 
 
 def resting(seed=0):
