@@ -89,7 +89,12 @@ def _table(result: _Rigs) -> list[str]:
     records, signals, whiskers = result
     wheels = []
     for name, (fits, _) in records.items():
-        wheels.append([name, *("; ".join(_pair(getattr(fit, key)) for fit in fits) for key in VALUES)])
+        found = [[getattr(fit, key) for fit in fits] for key in VALUES]
+        texts = [
+            ["unknown" if pair is None else "{:.3f} ± {:.3f}".format(*pair) for pair in pairs]
+            for pairs in found
+        ]
+        wheels.append([name, *map("; ".join, texts)])
     reckoned = (
         [name, *(f"{error:.2f}" for error in errors.flat)]
         for name, errors in zip(records, _errors(records), strict=True)
@@ -133,10 +138,6 @@ def _whisker_lines(signals: SignalRecord, fit: SignalFit) -> list[str]:
         "(tactile/README.md).",
     ]
     return lines
-
-
-def _pair(found: tuple[float, float] | None) -> str:
-    return "unknown" if found is None else f"{found[0]:.3f} ± {found[1]:.3f}"
 
 
 def _draw(result: _Rigs, png: Path) -> None:

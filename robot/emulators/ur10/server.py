@@ -70,16 +70,13 @@ class _ControllerServer:
                 due += missed * dt
             while due <= now:
                 due, steps = due + dt, steps + 1
-                self._step(now, steps)
-
-    def _step(self, now: float, number: int) -> None:
-        self.controller.tick(now)
-        if not self.faults.sends_states(number):
-            return
-        overrides = self.faults.overrides()
-        for session, connection in self.rtde.items():
-            if session.started and number % session.every == 0:
-                send(connection, session.state(overrides))
+                self.controller.tick(now)
+                if not self.faults.sends_states(steps):
+                    continue
+                overrides = self.faults.overrides()
+                for session, connection in self.rtde.items():
+                    if session.started and steps % session.every == 0:
+                        send(connection, session.state(overrides))
 
     async def _talk(
         self,
