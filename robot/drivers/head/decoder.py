@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter, deque
+from itertools import takewhile
 from threading import Lock
 from typing import NamedTuple
 
@@ -308,7 +309,8 @@ class FrameWindow:
 
     def between(self, first: int, last: int) -> Frames:
         """The present frames from first to last, both included, ordered by sequence number."""
-        with self._lock:
-            blocks = [block for low, high, block in self._blocks if low <= last and high >= first]
+        with self._lock:  # frames come at most `LATE` out of order, so that the newest blocks are enough
+            recent = takewhile(lambda entry: entry[1] >= first - LATE, reversed(self._blocks))
+            blocks = [block for low, high, block in recent if low <= last and high >= first]
         parts = zip(*(blocks or [self._empty]), strict=True)
         return Frames(*(np.concatenate(part) for part in parts)).select(first, last)
