@@ -1,50 +1,27 @@
 """Fixtures of the tests of `robot`: traces, and a check of errors in user input."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
 from tactile.base.errors import InputError
 
-SYNTHETIC = (
-    "a_square3",
-    "b_figure8_alias",
-    "c_corridor_wrap",
-    "d1_rotation_generic",
-    "e_kidnap",
-    "j_reverse_stop",
-)
-
 
 @pytest.fixture(scope="session")
-def find_trace(golden: Path, request: pytest.FixtureRequest) -> Callable[[str], Path]:
+def find_trace(golden, request):
     """Finds the path of a reference trace, in the project's golden files or among the recordings."""
 
-    def find(name: str) -> Path:
-        path = golden / f"{name}.npz"
-        if not path.is_file():
-            path = request.getfixturevalue("reference_data") / "traces" / f"{name}.npz"
-        if not path.is_file():
-            pytest.skip(f"no {path}")
-        return path
+    def find(name):
+        own = golden / f"{name}.npz"
+        return own if own.is_file() else request.getfixturevalue("reference_data") / "traces" / own.name
 
     return find
 
 
-@pytest.fixture(params=SYNTHETIC)
-def trace(request: pytest.FixtureRequest, find_trace: Callable[[str], Path]) -> Path:
-    """Each synthetic reference trace."""
-    return find_trace(request.param)
-
-
 @pytest.fixture
-def stream(tmp_path: Path) -> Callable[..., Path]:
+def stream(tmp_path):
     """Writes a small valid reference trace, with some arrays replaced (None: omitted)."""
 
-    def write(**changes: Any) -> Path:
+    def write(**changes):
         rows = np.arange(12)
         arrays = {
             "in_t": 100 + 0.5 * rows,
@@ -55,19 +32,26 @@ def stream(tmp_path: Path) -> Callable[..., Path]:
             "truth": np.stack([0.05 * rows, 0.0 * rows, 0.1 * rows], axis=1),
             "params_json": np.array('{"template_x_size": "3", "template_y_size": "2", "vt_match": "0.5"}'),
         }
-        arrays |= {name: np.asarray(value) for name, value in changes.items() if value is not None}
         path = tmp_path / "stream.npz"
-        np.savez(path, **{name: array for name, array in arrays.items() if changes.get(name, 0) is not None})
+        np.savez(path, **{name: array for name, array in (arrays | changes).items() if array is not None})
         return path
 
     return write
 
 
+def bits(value):
+    """What two equal lists or tuples of arrays, or of such, have in common: types, shapes, order, bytes."""
+    if isinstance(value, (tuple, list)):
+        return type(value), [bits(part) for part in value]
+    array = np.asarray(value)
+    return array.shape, array.dtype, array.flags.c_contiguous, array.tobytes()
+
+
 @pytest.fixture
-def refused() -> Callable[..., InputError]:
+def refused():
     """Checks that an action raises an InputError with all given pieces of text; returns it."""
 
-    def call(action: Callable[[], object], *pieces: str) -> InputError:
+    def call(action, *pieces):
         with pytest.raises(InputError) as caught:
             action()
         for piece in pieces:

@@ -17,8 +17,7 @@ from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.safety import ended_script_finding, stale_finding
 from tactile.base.random_streams import stream
 
-SHORTEST = 2e-4
-"""Shortest transmission delay, s."""
+SHORTEST = 2e-4  # transmission delay, s
 
 
 def pairs(seconds, rate=100.0, ppm=50.0, offset=3e4, seed=0):
@@ -29,7 +28,6 @@ def pairs(seconds, rate=100.0, ppm=50.0, offset=3e4, seed=0):
     delay = SHORTEST + np.minimum(random.exponential(4e-4, len(host)), 0.032)
     spikes = random.random(len(host)) < 0.02
     delay[spikes] += random.uniform(0, 0.032, spikes.sum())
-    # Messages arrive in order.
     return device, np.maximum.accumulate(host + delay), host
 
 
@@ -42,7 +40,6 @@ def fit_clock(device, arrival, clock=None):
 
 @given(st.floats(-150, 150), st.integers(0, 30), st.sampled_from([100.0, 125.0, 500.0]))
 def test_host_time_is_accurate_to_the_shortest_delay(ppm, seed, rate):
-    """The line is a lower bound of all arrivals."""
     device, arrival, host = pairs(8, rate, ppm, seed=seed)
     clock = fit_clock(device, arrival)
     off = clock.to_host(device) - host - SHORTEST
@@ -54,7 +51,6 @@ def test_host_time_is_accurate_to_the_shortest_delay(ppm, seed, rate):
 
 @pytest.mark.parametrize("drift", [-0.8e-6, 0.8e-6])
 def test_drift_is_tracked(drift):
-    """Pairs older than the window have no effect."""
     device, arrival, host = pairs(4 * WINDOW, 50.0, ppm=0)
     device = device + drift * (host - host[0]) ** 2  # by 192 ppm at the end
     clock = ClockSync()
@@ -182,14 +178,11 @@ def test_the_largest_delay_of_the_last_second_counts():
     assert meter.turn(12.0) == pytest.approx(1.78)
 
 
-def test_states_that_are_missing_because_this_machine_is_late():
+def test_missing_states_and_an_ended_script_are_the_fault_of_a_late_machine_or_not():
     assert stale_finding(0.11, 0.049, 0.1).outcome is SessionOutcome.ARM_STALE
     finding = stale_finding(0.11, 0.05, 0.1)
     assert finding.outcome is SessionOutcome.HOST_LATE
     assert "this machine was 0.050 s late" in finding.detail
-
-
-def test_a_control_script_that_ended():
     for config, unreset, late, machine in (
         (REAL, 0.099, 0.09, None),  # reset in time: something else ended the script
         (REAL, 0.13, 0.049, None),  # the controller or the network is slow
@@ -206,7 +199,6 @@ def test_a_control_script_that_ended():
 
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no scheduling policies")
 def test_control_before_mapping_before_drawing():
-    """Whatever this system allows."""
     subprocess.run([sys.executable, "-c", PRIORITIES], check=True, timeout=60)
 
 

@@ -1,8 +1,5 @@
 """Frames, arm states and whole sessions for the live recorder."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from robot.drivers.head.decoder import Cut, Frames, assemble_cycle
@@ -15,8 +12,7 @@ from tactile.base.types import Cycle, Odometry
 from tactile.whisker_geometry import HeadConfig
 
 W, RATE = 4, 200
-START = 5e4
-"""Start of a session, host time, s."""
+START = 5e4  # of a session, host time, s
 INFO = SourceInfo(raw_whiskers=True, head=HeadConfig(rest_deg=74.0))
 
 
@@ -41,7 +37,7 @@ def some_states(count: int, seed: int = 0) -> np.ndarray:
     return states
 
 
-def rows(frames: Frames, which: Any) -> Frames:
+def rows(frames: Frames, which) -> Frames:
     return Frames(*(column[which] for column in frames))
 
 
@@ -53,34 +49,23 @@ def motion_of_whisk(k: int) -> Odometry:
     return Odometry(*(np.float64(value) for value in (0.01 * (k % 3), 0.002, 0.05, 1.0)))
 
 
-def cut_of(k: int, frames: Frames, time: float | None = None, **more: Any) -> Cut:
-    """The cut of a whisk of these frames, at its own time or another."""
+def cut_of(k: int, frames: Frames, time: float | None = None, **more) -> Cut:
     return Cut.of(k, START + k if time is None else time, START + k, frames, motion_of_whisk(k), **more)
 
 
-def same_bits(one: Any, other: Any) -> bool:
-    """Whether two tuples of arrays are equal in every bit, shape, dtype and order in memory."""
-    if isinstance(one, tuple):
-        return type(one) is type(other) and all(map(same_bits, one, other))
-    a, b = np.asarray(one), np.asarray(other)
-    alike = a.flags.c_contiguous == b.flags.c_contiguous
-    return alike and (a.shape, a.dtype, a.tobytes()) == (b.shape, b.dtype, b.tobytes())
-
-
-def open_recorder(path: Path) -> LiveRecorder:
+def open_recorder(path) -> LiveRecorder:
     path.unlink(missing_ok=True)
     return LiveRecorder(Recorder(path, SourceDescription((2, 2, 1), W, 1.0, INFO)))
 
 
-def content(path: Path, kind: type) -> list[Any]:
-    """Content of a kind in a recording without damage."""
+def content(path, kind: type) -> list:
     scanner = McapScanner(path)
     found = [entry.content for entry in scanner.entries() if isinstance(entry.content, kind)]
     assert scanner.broken in ("", UNCLOSED)
     return found
 
 
-def session(path: Path, whisks: int = 3) -> tuple[list[Cycle], Frames]:
+def session(path, whisks: int = 3) -> tuple[list[Cycle], Frames]:
     """Records whisks, arm states and two events; returns the whisk cycles and all frames."""
     frames, states = some_frames(whisks * RATE, seed=whisks), some_states(whisks * 125)
     recorder, cycles = open_recorder(path), []

@@ -2,7 +2,6 @@
 
 import pickle
 import sys
-from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
@@ -24,8 +23,7 @@ from tactile.whisker_geometry import HeadConfig, ur10_head
 from tests.robot.live.live_recordings import RATE, START, cut_of, open_recorder, some_frames, some_states
 from tests.robot.live.live_recordings import rows as part
 
-HEAD = ur10_head(HeadConfig())
-WAY = ((0.1, 0.1, 0.0), (0.2, 0.1, 0.0), (0.2, 0.1, 90.0))
+HEAD, HZ = ur10_head(HeadConfig()), 125
 
 
 def route_of(config: LiveConfig):
@@ -33,8 +31,7 @@ def route_of(config: LiveConfig):
 
 
 def test_each_target_is_sent_once_after_arrival_at_the_last():
-    """That of a stopped arm is sent again."""
-    route, arm = route_of(LiveConfig(waypoints=WAY)), Mock()
+    route, arm = route_of(LiveConfig(waypoints=((0.1, 0.1, 0.0), (0.2, 0.1, 0.0), (0.2, 0.1, 90.0)))), Mock()
     route.resend_last()
     for count in (1, 2):
         assert not route.advance(arm)
@@ -74,9 +71,6 @@ def test_the_speed_is_the_lower_of_plan_and_arm_and_invalid_paths_are_refused():
     ):
         with pytest.raises(InputError, match=key):
             plan_path(LiveConfig.model_validate(settings), HEAD)
-
-
-HZ = 125
 
 
 def arc(config: LiveConfig, seconds: float, speed: float, turn: float) -> tuple[np.ndarray, ...]:
@@ -147,10 +141,8 @@ def test_old_states_are_dropped():
     assert not np.allclose(arm.pose(0.0), arm.pose(200.0 + time[-1] - 9.9))
 
 
-def work_of_blocks(path: Path, whisks: int, block: int, kind: str) -> np.ndarray:
-    """The work for each block of whisks [N, 3], from the arm's states and the head's frames to the
-    recording: calls (of C functions and generators' steps too), bytes written, bytes that the odometer
-    keeps."""
+def work_of_blocks(path, whisks: int, block: int, kind: str) -> np.ndarray:
+    """Calls, bytes that the odometer keeps and bytes written, for each block of whisks [N, 3]."""
     config = LiveConfig(noise=OdometryConfig(noise="gated"), odometry=kind, seed=1)
     odometer, recorder = ArmOdometry(config), open_recorder(path)
     time, speed = np.arange(HZ) / HZ, np.full((HZ, 6), 0.02)
@@ -186,9 +178,7 @@ def work_of_blocks(path: Path, whisks: int, block: int, kind: str) -> np.ndarray
 
 @pytest.mark.parametrize(("block", "blocks"), [(25, 8), pytest.param(1_600, 12, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("kind", ["pose", "velocity"])
-def test_a_whisk_costs_the_same_work_late_in_a_session(
-    tmp_path: Path, kind: str, block: int, blocks: int
-) -> None:
+def test_a_whisk_costs_the_same_work_late_in_a_session(tmp_path, kind, block, blocks):
     """What the odometer keeps bounds what it computes with; counted, not timed."""
     work = work_of_blocks(tmp_path / "a.mcap", blocks * block, block, kind)
     assert (work[-1] <= 1.05 * work[0]).all()
@@ -215,7 +205,7 @@ def monitor(*blocks: Frames) -> StrainMonitor:
 
 
 @given(st.lists(st.integers(1, 50), min_size=1, max_size=12) | st.just([300 * SIZE]))
-def test_rows_do_not_depend_on_the_pieces(sizes: list[int]) -> None:
+def test_rows_do_not_depend_on_the_pieces(sizes):
     places = 33 + np.cumsum([0, *sizes])
     pieces = monitor(*(frames(place, size) for place, size in zip(places, sizes, strict=False)))
     whole, count = monitor(frames(33, sum(sizes))), sum(sizes) // SIZE
@@ -227,8 +217,7 @@ def test_rows_do_not_depend_on_the_pieces(sizes: list[int]) -> None:
     assert len(pieces.rows(2)) == min(count, 2)
 
 
-def test_a_head_that_has_run_for_long_or_is_connected_again() -> None:
-    """Numbers may start anywhere and jump by 2^32."""
+def test_a_head_that_has_run_for_long_or_is_connected_again():
     late, jump = StrainMonitor(SAMPLED, PERIOD, SCALE, WHISKERS), 10**9 + 2**32
     late.begin()
     late.add(frames(10**9, SIZE))
@@ -241,7 +230,7 @@ def test_a_head_that_has_run_for_long_or_is_connected_again() -> None:
     assert (len(late.rows(9)), late.first) == (2, jump + 3 * SIZE)
 
 
-def test_the_strain_at_rest_is_subtracted_and_a_row_of_lost_samples_repeats_the_one_before() -> None:
+def test_the_strain_at_rest_is_subtracted_and_a_row_of_lost_samples_repeats_the_one_before():
     block = frames(33, 4 * SIZE)
     number = block.sequence - 33
     cut, whole = monitor(), monitor(block)
@@ -250,7 +239,7 @@ def test_the_strain_at_rest_is_subtracted_and_a_row_of_lost_samples_repeats_the_
     assert np.allclose(cut.rows(4), whole.rows(4)[[0, 0, 2, 3]] - rest, rtol=0, atol=1e-15)
 
 
-def test_lost_samples_of_a_series_are_interpolated_up_to_a_gap() -> None:
+def test_lost_samples_of_a_series_are_interpolated_up_to_a_gap():
     block = frames(33, 2 * SIZE)
     made = monitor(block)
     whole = made.series(block, 2, gap=5)

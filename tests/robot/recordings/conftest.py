@@ -1,5 +1,6 @@
 """Samples of all kinds for recordings, and their comparison to the bit; a small recording."""
 
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -22,26 +23,6 @@ INFO = SourceInfo(
     maze=MazeInfo(text="o---o\n|   |\no---o\n", heights=(0.05, 0.02), seed=3),
     provenance={"über": None, "numbers": [0.1, -0.0]},
 )  # fmt: skip
-
-
-def leaves(sample):
-    parts = [np.float64(sample.time), type(sample.reading), sample.truth is None]
-    odometry = sample.reading.odometry
-    rest = sample.reading._replace(odometry=None)
-    return [*parts, *odometry, *(part for part in rest if part is not None), sample.truth]
-
-
-def same_bits(one, other):
-    """Whether two sequences of samples are equal in every bit, shape and dtype."""
-
-    def key(value):
-        if isinstance(value, (np.ndarray, np.generic)):
-            return np.asarray(value).tobytes(), np.shape(value), np.asarray(value).dtype
-        return value
-
-    return len(one) == len(other) and all(
-        list(map(key, leaves(a))) == list(map(key, leaves(b))) for a, b in zip(one, other, strict=True)
-    )
 
 
 def write_recording(path, samples, **options):
@@ -90,6 +71,27 @@ def some_samples(count, seed=0, extreme=False):
                 )  # fmt: skip
         samples.append(Sample(0.5 * i, reading, truth))
     return samples
+
+
+def spoilt(content, rng):
+    """The content with a few bits, bytes and numbers changed, cut out or zeroed, or without its end."""
+    bad = bytearray(content)
+    for place in rng.integers(0, len(bad), rng.integers(1, 4)):
+        byte = slice(place, place + 1)
+        match int(rng.integers(6)):
+            case 0:
+                bad[byte] = (old ^ 1 << int(rng.integers(8)) for old in bad[byte])
+            case 1:
+                bad[place : place + 8] = struct.pack("<Q", int(rng.integers(1 << 62)) << 1)
+            case 2:
+                bad[place : place + int(2 ** rng.uniform(0, 12))] = b""
+            case 3:
+                bad[byte] = bytes([int(rng.integers(256))])
+            case 4:
+                bad[place : place + 16] = bytes(16)
+            case _:
+                del bad[place:]
+    return bytes(bad)
 
 
 @pytest.fixture(scope="module")

@@ -20,27 +20,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
+from zstandard import FRAME_HEADER as ZSTD_MAGIC
 
 from robot.recordings import cdr
 from robot.recordings.formats import FORMATS, open_recording
 from robot.recordings.input_judge import InputJudge
 from robot.recordings.mcap_reader import FORMAT, McapScanner, Recording, metadata_checksum
-from robot.recordings.mcap_writer import Recorder, record_source, recover
-from robot.recordings.npz_trace import read_trace
+from robot.recordings.mcap_writer import Recorder, recover
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.input_files import read_bytes
-from robot.sources.source import SOURCES, Sample, Source, SourceDescription, SourceEntry, SourceInfo
+from robot.sources.source import SOURCES, Sample, Source, SourceEntry, SourceInfo
 from tactile.base.errors import InputError
-from tactile.base.settings import Settings
 from tactile.base.types import Cycle, Observation, Odometry, Report, Whisk, observation
 from tests.helpers.distributions import install
 from tests.helpers.live import ROOT
 from tests.helpers.ros_bags import odometry, write_bag
-from tests.robot.recordings.conftest import INFO, SHAPE, WHISKERS, same_bits, some_samples, write_recording
-
-LIKE = SourceDescription(SHAPE, WHISKERS)
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-"""First bytes of a compressed chunk."""
+from tests.robot.conftest import bits
+from tests.robot.recordings.conftest import INFO, LIKE, SHAPE, WHISKERS, some_samples, spoilt, write_recording
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -66,7 +62,6 @@ def test_a_file_in_a_missing_folder_or_without_permission_is_refused(tmp_path, r
     refused(lambda: read_bytes(tmp_path / "no" / "run.csv"), "no such file", "the folder", "does not exist")
     path = tmp_path / "run.csv"
     path.write_text("t,vx,w\n0,0,0\n")
-
     denied = Mock(side_effect=PermissionError(13, "Permission denied", str(path)))
     monkeypatch.setattr(Path, "open", denied)
     refused(lambda: read_bytes(path), str(path), "(Permission denied)", "readable for this user")
@@ -98,17 +93,10 @@ def test_the_readme_example_runs(tmp_path):
     assert [sample.truth is None for sample in samples] == [False, False, True]
 
 
-class DotsConfig(Settings):
-    """A made-up format: one metre ahead for each dot in the file."""
-
-    file: Path
-
-
 @pytest.fixture
 def dots(monkeypatch, tmp_path):
-    """A file of the made-up format, beside a package that cannot be loaded."""
     opened = lambda config, warn: SimpleNamespace(length=config.file.read_text().count("."))  # noqa: E731
-    SOURCES.register("dots", SourceEntry(DotsConfig, opened, (".dots",)))
+    SOURCES.register("dots", SourceEntry(RecordingConfig, opened, (".dots",)))
     install(tmp_path / "site", "broken", "import nothing_there", {"ratslam.sources:broken": "broken:ENTRY"})
     monkeypatch.syspath_prepend(tmp_path / "site")
     path = tmp_path / "walk.DOTS"
@@ -137,7 +125,7 @@ def check_prefix(path, samples):
             raise
         return 0
     read = list(source)
-    assert same_bits(read, samples[: len(read)])
+    assert bits(read) == bits(samples[: len(read)])
     assert source.info == INFO.model_copy(update={"raw_whiskers": source.info.raw_whiskers})
     assert (source.length, warnings) == (len(read), [source.warning] if source.truncated else [])
     assert source.truncated or len(read) == len(samples)
@@ -146,7 +134,6 @@ def check_prefix(path, samples):
 
 @pytest.mark.parametrize("step", [pytest.param(1, marks=pytest.mark.soak), 31])
 def test_a_recording_truncated_at_any_byte_yields_a_prefix(step, tmp_path):
-    """The least number of samples with several chunks and every kind of reading."""
     samples = some_samples(5)
     assert {type(sample.reading) for sample in samples} == {Observation, Whisk, Cycle, Report}
     path = write_recording(tmp_path / "cut.mcap", samples, chunk_s=1.0)
@@ -173,31 +160,12 @@ def test_a_damaged_byte_is_noticed(step, small, tmp_path):
 
 
 def check_read(path, content, **recording):
-    """Checks that a damaged file is read, or gives an error that names it."""
     path.write_bytes(content)
     try:
         open_recording(RecordingConfig.model_validate({"file": path} | recording))
     except InputError as error:
         if str(path) not in str(error):
             raise
-
-
-def spoilt(content, rng):
-    """The content with a few bits, bytes and numbers changed, cut out or zeroed."""
-    bad = bytearray(content)
-    for place in rng.integers(0, len(bad), rng.integers(1, 4)):
-        match int(rng.integers(5)):
-            case 0:
-                bad[place % len(bad)] ^= 1 << int(rng.integers(8))
-            case 1:
-                bad[place : place + 8] = struct.pack("<Q", int(rng.integers(1 << 62)) << 1)
-            case 2:
-                bad[place : place + int(rng.integers(1, 40))] = b""
-            case 3:
-                bad[place : place + 1] = bytes([int(rng.integers(256))])
-            case _:
-                bad[place : place + 16] = bytes(16)
-    return bytes(bad)
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.soak) for k in range(100, 108))])
@@ -210,7 +178,6 @@ def test_random_damage_of_a_recording(seed, small, tmp_path):
 
 @pytest.mark.parametrize("suffix", [".npz", ".csv", ".bag", ".db3", ".mcap"])
 def test_random_damage_of_other_files(suffix, stream, tmp_path):
-    """The last three are bags."""
     recording = {"table": {"velocity": {}}} if suffix == ".csv" else {}
     if suffix == ".npz":
         content = stream().read_bytes()
@@ -251,8 +218,7 @@ def test_a_killed_recorder_loses_no_more_than_its_last_half_second(tmp_path):
     source = Recording(path)
     assert 20 <= source.length <= 25
     assert source.truncated
-    ends = f"it ends without its closing record; all {source.length} samples are there that were written"
-    assert source.warning == f"{path}: {ends}"
+    assert f"all {source.length} samples are there" in source.warning
     path.write_bytes(path.read_bytes()[:-1])  # cut in the middle of a message
     assert "the rest is lost: it ends too early" in Recording(path).warning
 
@@ -263,8 +229,7 @@ def test_written_samples_are_read_back_bit_for_bit(tmp_path_factory, count, seed
     path = write_recording(tmp_path_factory.getbasetemp() / "law.mcap", samples)
     with Recording(path) as source:
         assert isinstance(source, Source)
-        assert same_bits(list(source), samples)
-        assert same_bits(list(source), samples)  # a second iteration
+        assert bits(samples) == bits(list(source)) == bits(list(source))  # a second iteration
         assert (source.length, source.view_shape, source.whiskers) == (len(samples), SHAPE, WHISKERS)
         assert (source.truncated, source.warning, source.rate_hz) == (False, "", 2.0)
         raw = any(not isinstance(sample.reading, Observation) for sample in samples)
@@ -276,17 +241,6 @@ def test_the_file_depends_on_the_samples_alone(tmp_path):
     assert paths[0].read_bytes() == paths[1].read_bytes()
     one, same, other = (Recording(path).digest for path in paths)
     assert one == same != other
-    assert len(one) == 64
-
-
-def test_a_recorded_source_equals_the_source(find_trace, tmp_path):
-    with read_trace(find_trace("a_square3")) as source:
-        assert record_source(source, tmp_path / "copy.mcap") == source.length
-        record_source(Recording(tmp_path / "copy.mcap"), tmp_path / "again.mcap")
-        for name in ("copy", "again"):
-            copy = open_recording(RecordingConfig(file=tmp_path / f"{name}.mcap"))
-            assert same_bits(list(copy), list(source))
-            assert (copy.rate_hz, copy.info) == (source.rate_hz, source.info)
 
 
 def test_rosbags_reads_every_message_bit_for_bit(tmp_path):
@@ -306,11 +260,10 @@ def test_rosbags_reads_every_message_bit_for_bit(tmp_path):
         assert name == kind
         for field, values in fields.items():
             np.testing.assert_array_equal(getattr(message, field), np.ravel(values).squeeze(), field)
-        assert same_bits([Sample(*cdr.decode(name, data, SHAPE, WHISKERS), sample.truth)], [sample])
+        assert bits(cdr.decode(name, data, SHAPE, WHISKERS)) == bits(sample[:2])
 
 
 def ros_message(sample):
-    """The type of a sample's message, and fields with values of it."""
     reading = sample.reading
     found = {"time": sample.time, "dtheta": reading.odometry.dtheta}
     if isinstance(reading, Observation):
@@ -332,7 +285,7 @@ def test_recover_writes_a_complete_file(small, tmp_path):
     assert recover(cut, whole) == (found.length, "it ends too early")
     again = Recording(whole)
     assert not again.truncated
-    assert same_bits(list(again), samples[: found.length])
+    assert bits(list(again)) == bits(samples[: found.length])
     assert (again.view_shape, again.whiskers, again.info) == (SHAPE, WHISKERS, INFO)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.mcap", "whole.mcap"]
     assert recover(whole, tmp_path / "third.mcap") == (found.length, "")
@@ -387,7 +340,7 @@ def test_a_recorder_refuses_wrong_shapes_and_values(tmp_path, refused):
         narrow = good.reading._replace(view=np.full(SHAPE, 0.5, np.float32), label=3)
         recorder.write(good._replace(time=0.5, reading=narrow))
     first, second = Recording(path)
-    assert same_bits([first], [good])
+    assert bits(first) == bits(good)
     assert second.reading.label == 3
     assert (second.reading.view == 0.5).all()
 
@@ -395,7 +348,6 @@ def test_a_recorder_refuses_wrong_shapes_and_values(tmp_path, refused):
 def test_impossible_values_in_a_recording_are_refused(tmp_path, refused):
     for change, *pieces in (
         ({"time": 1.0}, "time goes back from 2.0 to 1.0 s", "sort the rows"),
-        ({"time": 2.0}, "time repeats 2.0 s", "drop the repeated rows"),
         ({"odometry": Odometry(np.nan, 0.0, 0.0, 0.5)}, "odometry is nan", "finite"),
         ({"odometry": Odometry(0.0, 0.0, 0.0, -0.5)}, "dt -0.5 s", "at least 0 s"),
         ({"view": np.full(SHAPE, np.nan)}, "in the reading is nan", "finite"),
@@ -420,7 +372,6 @@ def test_a_file_that_changes_while_it_is_read_is_noticed(small, tmp_path, refuse
 
 
 def test_a_chunk_of_excessive_size_is_not_decompressed(small, tmp_path):
-    """A frame header states 2^60 bytes; they are not allocated."""
     bad, path = bytearray(small[0]), tmp_path / "bomb.mcap"
     frame = bad.index(ZSTD_MAGIC)
     bad[frame + 4 : frame + 13] = b"\xe0" + struct.pack("<Q", 1 << 60)
@@ -436,7 +387,6 @@ INFOS = st.sampled_from(["{}", "[]", "{", "1", '{"cell_size": -1}', '{"calibrati
 
 @given(st.sampled_from(list(cdr.TOPICS)), st.binary(max_size=200), SHAPES, st.integers(-1, 1 << 40), INFOS)
 def test_a_valid_file_of_other_messages_is_refused(tmp_path_factory, name, message, shape, whiskers, info):
-    """Checksums are right, but the contents are not those of a recording."""
     path = tmp_path_factory.getbasetemp() / "strange.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -465,7 +415,6 @@ def test_a_recording_of_another_version_is_refused(tmp_path, refused, monkeypatc
 
 
 def test_source_info_is_stored_before_the_first_sample(tmp_path):
-    """A recorder killed at once leaves a file with its source info."""
     path = write_recording(tmp_path / "a.mcap", some_samples(2))
     content = path.read_bytes()
     path.write_bytes(content[: content.index(ZSTD_MAGIC)])
@@ -475,7 +424,6 @@ def test_source_info_is_stored_before_the_first_sample(tmp_path):
 
 
 def test_a_truth_in_degrees_is_refused(tmp_path, refused):
-    """All readers share the check of units, see `test_input_judge.py`."""
     seen = observation(Odometry(*map(np.float64, (0.05, 0.0, 0.3, 0.5))), view_shape=SHAPE, whiskers=WHISKERS)
     samples = [Sample(0.5 * i, seen, np.array([0, 0, 17.0 * i])) for i in range(40)]
     path = write_recording(tmp_path / "degrees.mcap", samples)

@@ -17,34 +17,23 @@ from robot.recordings.npz_trace import read_trace
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import Stretch
 from robot.sources.odometry import OdometryCorrection, from_poses, from_velocities, replace_steps
-from robot.sources.source import Source
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.se2 import between, integrate
-from tests.robot.conftest import SYNTHETIC
 
+SYNTHETIC = [
+    "a_square3", "b_figure8_alias", "c_corridor_wrap", "d1_rotation_generic", "e_kidnap", "j_reverse_stop",
+]  # fmt: skip
 REAL = ("f_real_intel_laser3x6", "f_real_tuc_lecture_hall")
-DEGREES, MILLIMETRES, MILLISECONDS = 180 / np.pi, 1000.0, 1000.0
+DEGREES, MILLIMETRES, MILLISECONDS, ROWS = 180 / np.pi, 1000.0, 1000.0, np.arange(400)
 
 
 def real_table(name, data):
-    """A real recording as CSV, without its views, and its settings."""
     if name == "intel":
         truth, pose = ({"x": f"{of}_x", "y": f"{of}_y", "heading": f"{of}_th"} for of in ("gt", "odo"))
         return data / "intel_odom_gt.csv", CsvConfig.model_validate({"pose": pose, "truth": truth})
     truth = {"file": data / "tuc_lecture_hall_gt.csv", "heading": "th"}
     settings = {"velocity": {"left": "vy"}, "truth": truth}
     return data / "tuc_lecture_hall_odom.csv", CsvConfig.model_validate(settings)
-
-
-def _check_margins(log):
-    """Each limit is far above its quantity."""
-    robot = judging.typical_motion(MotionTrack(log.time, log.moved, log.motion, log.truth))
-    ratios = [max(pair) / min(pair) if min(pair) else 1.0 for pair in (robot.path, robot.turning)]
-    assert 5 * robot.interval < DEFAULT_LIMITS.interval
-    assert 5 * max(robot.speed, robot.true_speed) < DEFAULT_LIMITS.speed
-    assert 5 * robot.turn_rate < DEFAULT_LIMITS.turn_rate
-    assert 5 * robot.turn < np.pi
-    assert 20 * max(ratios) < judging.RATIO
 
 
 PLANTED = [
@@ -64,7 +53,14 @@ def _arrays(trace):
 @pytest.mark.parametrize("name", [*SYNTHETIC, *REAL])
 def test_traces_pass_with_a_margin_and_are_refused_in_a_wrong_unit(name, find_trace, tmp_path, refused):
     trace, path = find_trace(name), tmp_path / "planted.npz"
-    _check_margins(read_trace(trace))
+    log = read_trace(trace)
+    robot = judging.typical_motion(MotionTrack(log.time, log.moved, log.motion, log.truth))
+    ratios = [max(pair) / min(pair) if min(pair) else 1.0 for pair in (robot.path, robot.turning)]
+    assert 5 * robot.interval < DEFAULT_LIMITS.interval
+    assert 5 * max(robot.speed, robot.true_speed) < DEFAULT_LIMITS.speed
+    assert 5 * robot.turn_rate < DEFAULT_LIMITS.turn_rate
+    assert 5 * robot.turn < np.pi
+    assert 20 * max(ratios) < judging.RATIO
     arrays = _arrays(trace)
     for array, factor, expected in PLANTED:
         if array == "in_view" and name == "f_real_tuc_lecture_hall":
@@ -97,9 +93,6 @@ def test_wrong_units_of_tables_are_refused(name, column, factor, expected, refer
     for truth in (config.truth, config.truth if column == "gt_th" else None):
         settings = config.model_copy(update={"truth": truth})
         refused(lambda settings=settings: read_csv_recording(planted, settings), str(planted), expected)
-
-
-ROWS = np.arange(400)
 
 
 def _drive():
@@ -182,8 +175,9 @@ def test_the_printed_cure_repeats_the_step_before(kind):
     assert np.hypot(*(mended - _drive()[2])[:, :2].T).max() < 0.09
 
 
-def test_two_wild_rows_are_a_jump_and_no_unit(trace, tmp_path, refused):
-    arrays, path = _arrays(trace), tmp_path / "wild.npz"
+@pytest.mark.parametrize("name", SYNTHETIC)
+def test_two_wild_rows_are_a_jump_and_no_unit(name, find_trace, tmp_path, refused):
+    arrays, path = _arrays(find_trace(name)), tmp_path / "wild.npz"
     for name, value in (("in_w", 1e5), ("in_v", 1e6)):
         arrays[name][[40, 41]] = value, -value
     np.savez(path, **arrays)
@@ -201,7 +195,6 @@ def test_limits_can_be_raised(stream, refused):
 
 @pytest.mark.parametrize("turns", [0.4, 5.0])
 def test_headings_in_degrees_are_detected(turns):
-    """Headings in radians pass, in degrees they are refused, wrapped or not."""
     time = np.arange(200) * 0.5
     heading = np.linspace(0, 2 * np.pi * turns, 200) - 1.0
     wrapped = (heading + np.pi) % (2 * np.pi) - np.pi
@@ -219,16 +212,16 @@ def test_an_empty_track_is_accepted(rows):
     assert judging.unit_errors(still._replace(moved=np.zeros(rows, bool), truth=None), "file") == []
 
 
-def test_a_trace_is_read_row_by_row(trace):
+@pytest.mark.parametrize("name", SYNTHETIC)
+def test_a_trace_is_read_row_by_row(name, find_trace):
+    trace = find_trace(name)
     source = read_trace(trace)
-    assert isinstance(source, Source)
     with np.load(trace) as arrays:
         np.testing.assert_array_equal(source.time, arrays["in_t"])
         np.testing.assert_array_equal(source.views.reshape(source.length, -1), arrays["in_view"])
         np.testing.assert_array_equal(source.truth, arrays["truth"])
         step = np.diff(arrays["in_t"], prepend=arrays["in_t"][:1])
         way, turn = arrays["in_v"] * step, arrays["in_w"] * step
-    # Motion is along the heading after the turn of a row.
     moved = np.column_stack([way * np.cos(turn), way * np.sin(turn), turn, step])
     np.testing.assert_allclose(source.motion, moved, atol=1e-12)
     assert (source.name, source.view_shape, source.whiskers) == (trace.stem, (3, 6, 1), 0)
@@ -261,7 +254,6 @@ def test_rows_without_odometry_do_not_advance_its_clock(stream):
 
 
 def test_views_of_two_columns_are_place_labels(stream, tmp_path):
-    """Unless the template has two pixels."""
     ids = np.column_stack([np.arange(12) // 3, np.zeros(12)])
     ids[4] = np.nan
     source = read_trace(stream(in_view=ids, in_flags=np.where(np.isnan(ids[:, 0]), 2.0, 3.0)))

@@ -19,15 +19,12 @@ REACHED, SWEEP = DATA / "stanford" / "reach_free_rows.csv", DATA / "stanford" / 
 CALIBRATION = DATA / "stanford" / "stage_calibration.csv"
 
 
-def test_a_reach_has_poses_and_whiskers():
+def test_a_reach_has_poses_and_whiskers_and_as_a_source_contacts_for_views(monkeypatch):
     record = read_reach(REACHED)
     assert record.signal.shape == (130, len(whiskers.WHISKERS), 3)
     np.testing.assert_allclose(record.position[0], [0.614017904, 0.244095653, 0.0448988117])
     np.testing.assert_allclose(record.signal[0, 13], [23.4805737, 697.151611, 518.673706])
     np.testing.assert_allclose(np.linalg.norm(record.quaternion, axis=1), 1.0, atol=1e-4)
-
-
-def test_a_reach_as_a_source_has_contacts_for_views(monkeypatch):
     source = whiskers.open_reach(whiskers.ReachConfig(file=REACHED, rate=100.0))
     samples = list(source)
     assert source.rate_hz == pytest.approx(100.0)
@@ -116,7 +113,7 @@ def cells():
     return loadmat(TAXELS)["TXZY_dataI"]
 
 
-def test_contacts_of_fingertips_are_the_cells(tmp_path):
+def test_contacts_of_fingertips_are_the_cells_and_those_of_one_object_a_source(tmp_path):
     contacts = read_contacts(TAXELS)
     assert [tuple(contact[:3]) for contact in contacts] == [(1, 1, 1), (1, 1, 2), (2, 1, 1), (2, 1, 2)]
     assert contacts[3].pressure.shape == (151, 3, 22)
@@ -125,13 +122,9 @@ def test_contacts_of_fingertips_are_the_cells(tmp_path):
     first, second = read_contacts(tmp_path / "trials.mat")
     np.testing.assert_array_equal(first.pressure[:, 0], cells()[0, 1, 0, 1])
     assert (second.object, second.contact) == (2, 1)
-
-
-def test_contacts_of_one_object_are_a_source():
     source = whiskers.open_contacts(whiskers.TaxelConfig(file=TAXELS, object=2))
     assert (source.view_shape, source.whiskers, source.length) == ((3, 22, 1), 66, 2 * 151)
-    first = next(iter(source)).reading.view[..., 0]
-    np.testing.assert_array_equal(first, read_contacts(TAXELS)[2].pressure[0])
+    np.testing.assert_array_equal(next(iter(source)).reading.view[..., 0], contacts[2].pressure[0])
     assert source.digest != whiskers.open_contacts(whiskers.TaxelConfig(file=TAXELS, object=1)).digest
     assert SOURCES.get("taxel_contacts", "source.plugin").config_class is whiskers.TaxelConfig
     with pytest.raises(InputError, match="1 to 2"):

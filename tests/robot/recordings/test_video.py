@@ -74,12 +74,9 @@ def test_the_first_frame_is_silent_and_steps_follow_the_stamps():
     assert camera_rows(noise, VIEW, None, "turn")[2] is None
 
 
-def test_turns_beyond_the_largest_rate_are_not_looked_for():
+def test_turns_beyond_the_largest_rate_black_frames_and_repeated_stamps():
     config = VisualOdometryConfig(fov_deg=360, max_turn_rate_deg=30)  # 3 degrees, 2.7 columns, in 0.1 s
     assert abs(np.rad2deg(moved(turning([0, 40]), config)[1, 2])) <= 3.4
-
-
-def test_black_frames_and_repeated_stamps_move_nothing():
     motion = moved([(time, np.zeros((24, 32), np.uint8)) for time in (0.0, 0.1, 0.1)], NARROW)
     assert (motion[:, :3] == 0).all()
     assert np.isfinite(motion).all()
@@ -94,9 +91,8 @@ UNFIT = {
 }
 
 
-@pytest.mark.parametrize("case", UNFIT)
-def test_faulty_frames_are_refused(case):
-    shapes, settings, expected = UNFIT[case]
+@pytest.mark.parametrize(("shapes", "settings", "expected"), UNFIT.values(), ids=UNFIT.keys())
+def test_faulty_frames_are_refused(shapes, settings, expected):
     frames = [(float(i), np.zeros(shape, np.uint8)) for i, shape in enumerate(shapes)]
     with pytest.raises(InputError, match=expected):
         camera_rows(frames, VIEW.model_copy(update=settings), None, "frames")
@@ -108,7 +104,6 @@ CAMERA = Camera(fov_deg=90, width=96, height=64)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A video with stamps, wheel odometry and truth."""
     folder = tmp_path_factory.mktemp("video")
     time, pose = WORLD.truth
     for name, codec in (("loop.avi", "MJPG"), ("loop.mp4", "mp4v")):
@@ -126,7 +121,6 @@ def folder(tmp_path_factory):
 
 
 def opened(folder, warn=None, **parts):
-    """A recording in the folder with visual odometry unless stated otherwise."""
     parts = {"file": "loop.avi", "video": {"rate": 10}, "visual_odometry": {"fov_deg": 90}} | parts
     return open_recording(RecordingConfig.model_validate(parts).resolved(folder), warn)
 
@@ -158,7 +152,6 @@ def test_stamps_give_the_times_of_frames_and_place_them_on_the_wheels_odometry(f
     every = opened(folder, video={"stamps": "stamps.csv", "every": 3})
     np.testing.assert_array_equal(every.time, source.time[::3])
     np.testing.assert_array_equal(every.views, source.views[::3])
-    # Wheel odometry replaces visual odometry.
     video = {"stamps": "stamps.csv", "odometry": "wheels.csv"}
     rolled = opened(folder, video=video, table={"velocity": {}})
     _, speed, turn = WORLD.wheels()
@@ -189,9 +182,8 @@ FAULTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", FAULTS)
-def test_faults_are_one_error_each(case, folder):
-    parts, expected = FAULTS[case]
+@pytest.mark.parametrize(("parts", "expected"), FAULTS.values(), ids=FAULTS.keys())
+def test_faults_are_one_error_each(parts, expected, folder):
     with pytest.raises(InputError, match=expected) as error:
         opened(folder, **parts)
     assert len(str(error.value).splitlines()) == 1

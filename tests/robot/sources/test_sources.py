@@ -1,7 +1,6 @@
 """Sources in memory, their motion, corrections, perturbed copies, and controls with other views."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,14 +31,12 @@ ROWS, WHISKERS = 6, 4
 
 
 def source(alive: np.ndarray) -> InMemorySource:
-    every, label = np.ones(ROWS, bool), np.full(ROWS, -1, np.int32)
-    views = np.zeros((ROWS, 1, WHISKERS, 1))
-    return InMemorySource(
-        "test", "0", np.arange(ROWS, dtype=float), np.ones((ROWS, 4)), every, views, every, label, alive=alive
-    )
+    time, every, label = np.arange(ROWS, dtype=float), np.ones(ROWS, bool), np.full(ROWS, -1, np.int32)
+    motion, views = np.ones((ROWS, 4)), np.zeros((ROWS, 1, WHISKERS, 1))
+    return InMemorySource("test", "0", time, motion, every, views, every, label, alive=alive)
 
 
-def test_rows_have_their_flags_and_contacts() -> None:
+def test_rows_have_their_flags_and_contacts():
     alive = np.arange(ROWS)[:, None] % 3 != np.arange(WHISKERS) % 3
     point = np.arange(ROWS * WHISKERS * 2, dtype=float).reshape(ROWS, WHISKERS, 2)
     log = replace(source(alive), contact=alive, point=point)
@@ -51,7 +48,6 @@ def test_rows_have_their_flags_and_contacts() -> None:
     np.testing.assert_array_equal(load_into_memory(log).alive, alive)
     for sample in source(alive[1]):  # one row of flags holds for all
         np.testing.assert_array_equal(sample.reading.alive, alive[1])
-    # A cut log starts without motion and leaves the original.
     log = source(np.ones(WHISKERS, bool))
     part = cut_log(log, 2, 5)
     assert part.motion.any(axis=1).tolist() == [False, True, True]
@@ -61,8 +57,7 @@ def test_rows_have_their_flags_and_contacts() -> None:
 
 
 @given(MOTIONS, st.sampled_from([MIDPOINT, TURN_THEN_MOVE]))
-def test_motions_come_from_poses_and_velocities(motions: np.ndarray, heading: float) -> None:
-    """The first row only sets the clock."""
+def test_motions_come_from_poses_and_velocities(motions, heading):
     motion = odometry.from_velocities(np.arange(len(motions)) + 7.0, *motions.T, heading)
     assert (motion[0] == 0).all()
     np.testing.assert_allclose(np.hypot(*motion[1:, :2].T), np.hypot(*motions[1:, :2].T), atol=1e-12)
@@ -74,20 +69,7 @@ def test_motions_come_from_poses_and_velocities(motions: np.ndarray, heading: fl
     assert found[:, 3].tolist() == [0.0] + [0.5] * (len(motions) - 1)
 
 
-def test_the_mid_heading_closes_a_circle() -> None:
-    """Forty steps of 9 degrees: the mid heading has an error of second order, the new one of first order."""
-    time, turn = np.arange(41) * 0.5, np.full(41, np.pi / 10)
-    middle, after = (
-        integrate(odometry.from_velocities(time, np.full(41, 0.1), 0.0, turn, heading)[:, :3])
-        for heading in (MIDPOINT, TURN_THEN_MOVE)
-    )
-    np.testing.assert_allclose([middle[-1], after[-1]], 0, atol=1e-12)
-    # Half a circle ends straight to the left.
-    assert np.hypot(*middle[20, :2]) == pytest.approx(2 / np.pi, rel=2e-3)
-    assert abs(middle[20, 0]) < 1e-12 < 0.04 < abs(after[20, 0])
-
-
-def test_scaled_and_bent_motions_are_made_straight() -> None:
+def test_scaled_and_bent_motions_are_made_straight():
     random = np.random.default_rng(0)
     way, turn, time = random.uniform(0, 0.2, 300), random.normal(0, 0.2, 300), np.arange(300.0)
     truth = odometry.from_motions(time, way, 0.0, turn)
@@ -98,7 +80,7 @@ def test_scaled_and_bent_motions_are_made_straight() -> None:
 
 
 @pytest.mark.parametrize("kind", ["table", "whiskers"])
-def test_a_recording_is_corrected_as_it_is_read(kind: str, tmp_path: Path) -> None:
+def test_a_recording_is_corrected_as_it_is_read(kind, tmp_path):
     if kind == "table":
         (tmp_path / "a.csv").write_text("t,distance,turn\n0,0,0\n1,0.1,0.2\n2,0.1,-0.1\n")
         given = {"file": tmp_path / "a.csv", "table": {"motion": {}}}
@@ -120,7 +102,7 @@ def test_a_recording_is_corrected_as_it_is_read(kind: str, tmp_path: Path) -> No
             np.testing.assert_array_equal(after.reading.contact, before.reading.contact)
 
 
-def test_observations_are_corrected_in_their_odometry_only_by_positive_scales() -> None:
+def test_observations_are_corrected_in_their_odometry_only_by_positive_scales():
     motion = np.array([[0.1, 0.0, 0.2], [0.0, 0.0, -0.3]])
     before = [observation(Odometry(*row, 0.5), np.ones((1, 2, 1))) for row in motion]
     after = odometry.correct_observations(ERRORS, before)
@@ -131,9 +113,6 @@ def test_observations_are_corrected_in_their_odometry_only_by_positive_scales() 
     for name in ("length_scale", "turn_scale"):
         with pytest.raises(ValueError, match=name):
             OdometryCorrection.model_validate({name: 0.0})
-
-
-# Perturbed copies and controls
 
 
 @pytest.fixture

@@ -1,8 +1,5 @@
 """Arenas: free space, walls and objects, the file format; contact of whiskers with walls in closed form."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,14 +12,11 @@ from robot.world import walls as geometry
 from robot.world.arena import Arena, ArenaConfig, arena_text, make_arena, read_arena
 from robot.world.maze import random_loop, random_maze, wall_boxes
 from robot.world.walls import NO_CONTACT, Surroundings, Walls
-from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.whisker_geometry import Head, HeadConfig, RingConfig, shaft_points, ur10_head
 
 SEEDS = st.integers(0, 10**6)
-KINDS = st.sampled_from(
-    [ArenaConfig(side=side, rotated=rotated) for side in (1.25, 2.5) for rotated in (False, True)]
-)
+KINDS = st.builds(ArenaConfig, side=st.sampled_from([1.25, 2.5]), rotated=st.booleans())
 GOOD = """# a room
 outer 0 0  2 0  2 2  0 2
 square 0.3 1.7 0.2 30
@@ -34,7 +28,7 @@ start 1 1 90
 
 @settings(max_examples=12)
 @given(SEEDS, KINDS)
-def test_passages_are_wide_enough_and_all_free_space_is_connected(seed: int, config: ArenaConfig) -> None:
+def test_passages_are_wide_enough_and_all_free_space_is_connected(seed, config):
     arena = make_arena(config, seed)
     assert len(arena.objects) == config.count
     for number, one in enumerate(arena.objects):
@@ -48,7 +42,7 @@ def test_passages_are_wide_enough_and_all_free_space_is_connected(seed: int, con
     assert regions == 1
 
 
-def test_an_arena_follows_from_its_seed() -> None:
+def test_an_arena_follows_from_its_seed():
     def described(arena: Arena) -> np.ndarray:
         side = [one[1] - one[0] for one in arena.objects]
         turn = [np.degrees(np.arctan2(y, x)) for x, y in side]
@@ -70,7 +64,7 @@ def test_an_arena_follows_from_its_seed() -> None:
     assert make_arena(ArenaConfig(objects=0), 0).objects == ()
 
 
-def test_what_does_not_fit_is_refused(refused: Callable[..., InputError], monkeypatch) -> None:
+def test_what_does_not_fit_is_refused(refused, monkeypatch):
     monkeypatch.setattr("robot.world.arena.MAX_RESTARTS", 2)
     narrow = Arena("narrow", geometry.square(np.zeros(2), 0.3, 0.0), (), np.zeros(3))
     refused(lambda: arenas.place_start(narrow, 0), "no room")
@@ -83,9 +77,7 @@ def test_what_does_not_fit_is_refused(refused: Callable[..., InputError], monkey
 
 @settings(max_examples=30)
 @given(SEEDS, KINDS)
-def test_wall_segments_free_space_and_file_describe_the_same_arena(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, config: ArenaConfig
-) -> None:
+def test_wall_segments_free_space_and_file_describe_the_same_arena(tmp_path_factory, seed, config):
     """A line from inside to outside crosses an odd number of walls."""
     arena, path = make_arena(config, seed), tmp_path_factory.getbasetemp() / "room.txt"
     path.write_text(arena_text(arena))
@@ -102,14 +94,13 @@ def test_wall_segments_free_space_and_file_describe_the_same_arena(
 
 
 @given(SEEDS, st.floats(-10, 10))
-def test_segments_have_their_distance_and_rotated_squares_stay_square(seed: int, angle: float) -> None:
+def test_segments_have_their_distance_and_rotated_squares_stay_square(seed, angle):
     random = np.random.default_rng(seed)
     walls, points = random.uniform(-1, 1, (5, 4)), random.uniform(-1, 1, (7, 2))
     along = walls[:, :2] + np.linspace(0, 1, 2001)[:, None, None] * (walls[:, 2:] - walls[:, :2])
     sampled = np.linalg.norm(points[:, None, None] - along, axis=-1).min(axis=1)
     assert np.allclose(geometry.segment_distance(walls, points), sampled, atol=1e-3)
     assert (geometry.segment_distance(walls, points) <= sampled + 1e-12).all()
-
     one = geometry.square(np.array([0.3, -0.2]), 0.4, angle)
     assert geometry.polygon_area(one) == pytest.approx(0.16)
     points = np.random.default_rng(seed).uniform(-0.5, 0.5, (50, 2))
@@ -121,9 +112,7 @@ def test_segments_have_their_distance_and_rotated_squares_stay_square(seed: int,
     assert geometry.segments_cross(sides, np.array([[0.3, -0.2, 2.3, -0.1]])).sum() == 1
 
 
-def test_an_arena_file_gives_walls_objects_and_start_and_a_faulty_one_is_refused(
-    tmp_path: Path, refused: Callable[..., InputError]
-) -> None:
+def test_an_arena_file_gives_walls_objects_and_start_and_a_faulty_one_is_refused(tmp_path, refused):
     path = tmp_path / "room.txt"
     path.write_text(GOOD)
     read = read_arena(path)
@@ -163,12 +152,8 @@ def test_an_arena_file_gives_walls_objects_and_start_and_a_faulty_one_is_refused
     refused(lambda: read_arena(path), "room.txt", "is not text")
 
 
-# Contact, compared with a search over all angles and points of the shaft
-
-STEP = 1 / 600
-"""Step of the search, as a fraction of the sweep."""
-SHARES = np.arange(1, 161) / 160
-"""Checked points of the shaft, as fractions of its length."""
+STEP, SHARES = 1 / 600, np.arange(1, 161) / 160
+"""Step of the search, and its points of the shaft, as fractions of the sweep and of the length."""
 WIDE = (RingConfig(length=0.05, radius=0.09, height=0.09), RingConfig(length=0.16, radius=0.12, height=0.17))
 FIVE = (RingConfig(length=0.16, radius=0.05, height=0.16),)
 HEADS = {
@@ -205,7 +190,7 @@ def search_contact(head: Head, boxes: Walls, pose: np.ndarray, sweep: float) -> 
 
 
 @pytest.mark.parametrize("name", HEADS)
-def test_contact_agrees_with_the_search(name: str) -> None:
+def test_contact_agrees_with_the_search(name):
     config, degrees = HEADS[name]
     head, sweep = ur10_head(config), np.radians(degrees)
     random = np.random.default_rng(0)
@@ -230,7 +215,7 @@ def test_contact_agrees_with_the_search(name: str) -> None:
     assert np.quantile(beside, 0.95) < 0.01
 
 
-def test_the_tip_touches_the_top_of_a_wall_and_the_shaft_its_far_edge() -> None:
+def test_the_tip_touches_the_top_of_a_wall_and_the_shaft_its_far_edge():
     """By hand: a 100 mm whisker, horizontal at rest, with its base 100 mm above the floor on the axis."""
     ring = RingConfig(length=0.1, radius=1e-9, height=0.1)
     head = ur10_head(HeadConfig(rings=(ring,), whiskers=1, rest_deg=90.0, limit_deg=90.0))
@@ -250,7 +235,7 @@ def test_the_tip_touches_the_top_of_a_wall_and_the_shaft_its_far_edge() -> None:
 
 @settings(max_examples=15)
 @given(st.integers(0, 50), st.integers(1, 12))
-def test_a_query_of_many_poses_equals_queries_of_each(seed: int, count: int) -> None:
+def test_a_query_of_many_poses_equals_queries_of_each(seed, count):
     random, walls, head = np.random.default_rng(seed), maze_of(seed), ur10_head(HeadConfig())
     pose = np.column_stack([random.uniform(-0.1, 0.64, (count, 2)), random.uniform(-9, 9, count)])
     pose[0] = 30.0, -20.0, 1.0  # far from walls

@@ -1,9 +1,7 @@
 """Mazes: random loops, walls as boxes, the file format, routes, and the head's paths along them."""
 
-from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 
 import networkx
 import numpy as np
@@ -14,15 +12,13 @@ from hypothesis import strategies as st
 from robot.world import maze as mazes
 from robot.world.maze import CELL_SIDE, Cell, Maze, circuit_route, closed_maze, random_loop, read_maze
 from robot.world.scene import HeadPath, JitterConfig, MotionConfig, add_kidnaps, plan_path, poses_at
-from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 
-SEEDS = st.integers(0, 10**6)
+SEEDS, STEADY = st.integers(0, 10**6), JitterConfig(position=0, yaw_deg=0, speed=0)
 
 
 def cells(text: str) -> list[Cell]:
-    """Cells written as column and row."""
     return [(int(column), int(row)) for column, row in text.split()]
 
 
@@ -56,7 +52,7 @@ def boxes_of(maze: Maze, seed: int = 0, *heights: tuple[float, ...]) -> mazes.Wa
 
 
 @given(SEEDS, st.sampled_from([(7, 5, 20), (5, 5, 20), (12, 8, 40), (2, 2, 4), (3, 2, 6)]))
-def test_a_loop_is_closed_simple_and_anticlockwise(seed: int, size: tuple[int, int, int]) -> None:
+def test_a_loop_is_closed_simple_and_anticlockwise(seed, size):
     loop = random_loop(*size, stream(seed, "maze.loop"))
     place = np.array(loop)
     assert len(set(loop)) == len(loop) == size[2]
@@ -69,7 +65,7 @@ def test_a_loop_is_closed_simple_and_anticlockwise(seed: int, size: tuple[int, i
 
 
 @given(SEEDS, st.integers(1, 9), st.integers(1, 9))
-def test_one_way_joins_each_two_cells_of_a_tree(seed: int, columns: int, rows: int) -> None:
+def test_one_way_joins_each_two_cells_of_a_tree(seed, columns, rows):
     maze = mazes.tree_maze(columns, rows, np.random.default_rng(seed))
     every = [(column, row) for column in range(columns) for row in range(rows)]
     graph = networkx.Graph()
@@ -80,7 +76,7 @@ def test_one_way_joins_each_two_cells_of_a_tree(seed: int, columns: int, rows: i
     assert maze.along[:, [0, -1]].all()
 
 
-def test_a_seed_gives_the_same_maze_and_route_for_ever() -> None:
+def test_a_seed_gives_the_same_maze_and_route_for_ever():
     maze, loop = world(3)
     assert loop == cells("32 22 12 11 10 20 21 31")
     assert mazes.maze_text(maze) == DRAWN
@@ -95,7 +91,7 @@ def test_a_seed_gives_the_same_maze_and_route_for_ever() -> None:
 
 
 @given(SEEDS)
-def test_the_loop_is_open_and_the_outer_wall_closed(seed: int) -> None:
+def test_the_loop_is_open_and_the_outer_wall_closed(seed):
     maze, loop = world(seed, share=1.0)
     assert maze.across[[0, -1]].all()
     assert maze.along[:, [0, -1]].all()
@@ -107,9 +103,7 @@ def test_the_loop_is_open_and_the_outer_wall_closed(seed: int) -> None:
 
 
 @given(SEEDS, st.floats(0, 1), st.sampled_from([(7, 5), (12, 8), (2, 2)]))
-def test_a_maze_file_is_read_back_equal(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, share: float, size: tuple[int, int]
-) -> None:
+def test_a_maze_file_is_read_back_equal(tmp_path_factory, seed, share, size):
     maze, _ = world(seed, share, size, 4)
     path, text = tmp_path_factory.getbasetemp() / "maze.txt", mazes.maze_text(maze)
     for written in (text, text.replace("o", "+"), "\n\n" + text + "\n", text.rstrip()):
@@ -117,7 +111,7 @@ def test_a_maze_file_is_read_back_equal(
         assert all(np.array_equal(a, b) for a, b in zip(read_maze(path), maze, strict=True))
 
 
-def test_a_faulty_maze_file_is_refused(tmp_path: Path, refused: Callable) -> None:
+def test_a_faulty_maze_file_is_refused(tmp_path, refused):
     path = tmp_path / "maze.txt"
     path.write_text(GOOD)
     read_maze(path)
@@ -137,7 +131,7 @@ def test_a_faulty_maze_file_is_refused(tmp_path: Path, refused: Callable) -> Non
         refused(lambda: read_maze(path), f"maze.txt{where}: ", found)
 
 
-def test_boxes_are_at_the_walls_of_the_maze() -> None:
+def test_boxes_are_at_the_walls_of_the_maze():
     """Two cells with a wall between: across, along, posts; west, south, east, north."""
     boxes, post, long = boxes_of(closed_maze(2, 1)), 0.006, CELL_SIDE - 0.006
     flat = [[x + post, y - post, x + long, y + post] for y in (0, CELL_SIDE) for x in (0, CELL_SIDE)]
@@ -155,7 +149,7 @@ def test_boxes_are_at_the_walls_of_the_maze() -> None:
     assert mazes.cell_centre((2, 0)).tolist() == pytest.approx([0.45, 0.09])
 
 
-def test_changed_walls_are_those_named_and_a_change_that_is_none_is_refused(refused: Callable) -> None:
+def test_changed_walls_are_those_named_and_a_change_that_is_none_is_refused(refused):
     before, _ = world(3)
     gap = next((c, r) for r in range(3) for c in range(3) if not before.along[r, c + 1])
     wall = next((c, r) for r in range(3) for c in range(3) if before.along[r, c + 1])
@@ -175,9 +169,7 @@ def test_changed_walls_are_those_named_and_a_change_that_is_none_is_refused(refu
 
 
 @given(st.text("CAca", min_size=1, max_size=12), st.integers(0, 1000))
-def test_each_letter_is_one_circuit_and_explorations_turn_back_in_dead_ends_only(
-    word: str, seed: int
-) -> None:
+def test_each_letter_is_one_circuit_and_explorations_turn_back_in_dead_ends_only(word, seed):
     maze, loop = world(seed)
     way = circuit_route(loop, word)
     mazes.check_route(maze, way)
@@ -194,14 +186,14 @@ def test_each_letter_is_one_circuit_and_explorations_turn_back_in_dead_ends_only
 
 
 @given(st.integers(1, 8), st.integers(1, 8), st.integers(0, 1000))
-def test_a_winding_loop_visits_every_cell_once(columns: int, rows: int, seed: int) -> None:
+def test_a_winding_loop_visits_every_cell_once(columns, rows, seed):
     columns, rows = 2 * columns, 2 * rows
     loop = mazes.winding_loop(columns, rows, stream(seed, "loop"))
     assert sorted(loop) == [(x, y) for x in range(columns) for y in range(rows)]
     assert (np.abs(np.diff([*loop, loop[0]], axis=0)).sum(axis=1) == 1).all()
 
 
-def test_impossible_loops_words_and_routes_are_refused(refused: Callable[..., InputError]) -> None:
+def test_impossible_loops_words_and_routes_are_refused(refused):
     for size in ((7, 5, 21), (7, 5, 2), (3, 3, 10), (7, 5, 36), (5, 1, 4)):
         refused(lambda size=size: random_loop(*size, stream(0, "x")), "maze.loop", f"{size[2]} cells")
     for word in ("", "CAB", "C A"):
@@ -224,11 +216,6 @@ def test_impossible_loops_words_and_routes_are_refused(refused: Callable[..., In
     refused(lambda: mazes.make_anticlockwise(SQUARE[:3]), "3 cells")
 
 
-# Paths of the head
-
-STEADY = JitterConfig(position=0, yaw_deg=0, speed=0)
-
-
 def route(seed: int, word: str = "CA") -> list[tuple[int, int]]:
     return circuit_route(random_loop(5, 4, 12, stream(seed, "maze.loop")), word)
 
@@ -238,7 +225,7 @@ def path_of(seed: int, **changes: object) -> HeadPath:
 
 
 @given(SEEDS)
-def test_without_jitter_the_path_joins_cell_centres_and_faces_ahead(seed: int) -> None:
+def test_without_jitter_the_path_joins_cell_centres_and_faces_ahead(seed):
     path = path_of(seed, jitter=STEADY)
     passed = path.pose[np.concatenate([[True], np.abs(np.diff(path.pose[:, :2], axis=0)).sum(axis=1) > 1e-9])]
     assert np.allclose(passed[:, :2], [mazes.cell_centre(cell) for cell in route(seed)], atol=1e-12)
@@ -252,7 +239,6 @@ def test_without_jitter_the_path_joins_cell_centres_and_faces_ahead(seed: int) -
     assert np.allclose(np.abs(step[~straight, 2]) / took[~straight], 0.4)
     assert (np.abs(step[:, 2]) <= np.pi + 1e-12).all()
     assert np.isclose(path.duration, 24 * CELL_SIDE / 0.03 + np.abs(step[:, 2]).sum() / 0.4)
-    # Backwards it faces against the direction of travel.
     there, back = (
         plan_path(MotionConfig(jitter=STEADY, backwards=way < 0), route(seed, "A")[::way], stream(seed, "m"))
         for way in (1, -1)
@@ -265,7 +251,7 @@ def test_without_jitter_the_path_joins_cell_centres_and_faces_ahead(seed: int) -
     assert (poses_at(there, np.array([-5.0, 1e9])) == there.pose[[0, -1]]).all()
 
 
-def test_the_path_of_a_seed_stays_the_same_with_the_configured_jitter() -> None:
+def test_the_path_of_a_seed_stays_the_same_with_the_configured_jitter():
     path = path_of(3, jitter=JitterConfig(position=0.005, yaw_deg=3.0, speed=0.1))
     assert (np.diff(path.time) > 0).all()
     np.testing.assert_allclose(path.time[[1, 2, -1]], [6.165587, 10.092578, 191.124197], atol=1e-6)
@@ -276,7 +262,7 @@ def test_the_path_of_a_seed_stays_the_same_with_the_configured_jitter() -> None:
 @settings(max_examples=40)
 @given(SEEDS, st.lists(st.floats(0.05, 0.7), min_size=1, max_size=4), st.floats(1.0, 30.0))
 @example(0, [0.95], 45.0)
-def test_a_kidnap_continues_at_the_later_pose(seed: int, shares: list[float], ahead: float) -> None:
+def test_a_kidnap_continues_at_the_later_pose(seed, shares, ahead):
     path = path_of(seed)
     when = [share * path.duration for share in shares]
     there, jumps = add_kidnaps(path, when, ahead)

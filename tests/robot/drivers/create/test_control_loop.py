@@ -20,11 +20,8 @@ NUMBER = st.one_of(st.floats(-0.3, 0.3), st.floats())
 
 
 class Line:
-    """A serial port in memory: commands reach the robot at once, `mangle` changes its replies.
-
-    Attributes:
-        now: its clock, s; a read that times out advances it. waiting: bytes that a read gives.
-    """
+    """A serial port in memory: commands reach the robot at once, `mangle` changes its replies; a read that
+    times out advances its clock `now`, s."""
 
     def __init__(self):
         self.robot = EmulatedCreate(CreateEmulatorConfig())
@@ -60,7 +57,6 @@ class Line:
             raise OSError(5, "Input/output error")
 
     def control_loop(self, **settings):
-        """A control loop of this robot, which is awake and in safe mode."""
         link = SerialLink(self)
         for command in (protocol.START, protocol.SAFE):
             link.send(command)
@@ -74,7 +70,6 @@ def rolls(robot):
 
 
 def drive(line, loop, seconds, forward, turn=0.0):
-    """Polls and steers for some seconds; refused commands are repeated."""
     for _ in range(round(seconds / PERIOD)):
         try:
             loop.steer(forward, turn)

@@ -68,8 +68,7 @@ def alone(tmp_path):
 
 
 def create(emulated, **settings):
-    """A driver with longer time limits than usual, since the machine may be busy. Its watchdog does not wait
-    for a disconnected port."""
+    """A driver for a busy machine, whose watchdog does not wait for a disconnected port."""
     usual = {"silence": 5.0, "patience": 5.0, "replug": 0.01}
     return CreateDriver(CreateConfig(port=emulated.path, **{**usual, **settings}))
 
@@ -82,7 +81,6 @@ def drive_for(driver, seconds, forward, turn=0.0):
 
 
 def stop_and_read(driver):
-    """Stops and reads the last millimetres."""
     driver.stop()
     good = driver.counts.good
     until(lambda: driver.counts.good > good + 1)
@@ -148,9 +146,7 @@ def test_switching_off_and_unplugging_stop_a_driving_robot(emulated):
         drive_for(driver, 0.2, 0.1)
         emulated.do("off")
         assert until(lambda: driver.active_stop).reason is StopReason.SILENT
-    driver = create(emulated)
-    driver.start()
-    try:
+    with create(emulated) as driver:
         drive_for(driver, 0.2, 0.1)
         emulated.do("unplug")
         assert until(lambda: driver.active_stop).reason is StopReason.UNPLUGGED
@@ -158,8 +154,6 @@ def test_switching_off_and_unplugging_stop_a_driving_robot(emulated):
             driver.drive(0.1, 0.0)
         driver.stop()
         driver.odometry()
-    finally:
-        driver.close()
     driver.close()
     with pytest.raises(CommandRefused, match="not started"):
         driver.drive(0.1, 0.0)
@@ -204,7 +198,6 @@ SerialLink.send = send_and_hang
 
 @contextmanager
 def driving(alone, code=DRIVES):
-    """A program that drives the robot, once it does."""
     program = subprocess.Popen([sys.executable, "-c", code, alone.path])
     try:
         until(lambda: alone.wheels() == [100, 100])
@@ -216,7 +209,6 @@ def driving(alone, code=DRIVES):
 
 @pytest.mark.parametrize("killed", [False, True])
 def test_a_rolling_robot_is_stopped_when_its_port_returns(alone, killed):
-    """By the watchdog process: the driver, or the program that it runs in, has ended."""
     with driving(alone) as program:
         alone.do("unplug")
         if killed:
@@ -248,7 +240,6 @@ def test_ports_without_a_create_are_refused(monkeypatch):
     master, slave = os.openpty()
     try:
         for port, refusal, match in (
-            ("/dev/ttyNONE", NoPort, "no such port"),
             ("/dev/null", NoPort, "/dev/null"),
             (os.ttyname(slave), NoAnswer, "switch it on"),
         ):

@@ -13,12 +13,7 @@ WHISKERS = 2
 
 
 class MemoryHead:
-    """A head, and a `robot.drivers.head.device.Bridge` to it.
-
-    Attributes:
-        plugged: whether it is connected. stalls: number of transfers to refuse next. clock: device time, us.
-        commands, requests: received so far. opened, closed: number of connections opened and closed.
-    """
+    """A head, and a Bridge to it; `stalls` counts the transfers to refuse next, `clock` is its time, us."""
 
     def __init__(self, whiskers=WHISKERS):
         self.identity = {"name": "memory", "version": "1", "whiskers": whiskers, "channels": CHANNELS}

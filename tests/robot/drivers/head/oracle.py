@@ -120,23 +120,17 @@ def flip_bits(frame, place, mask):
     return bytes(data)
 
 
-SKIPS = (2, 3, 50, 4095, 4096, 4097, 2**31 - 1, 2**31)
-BACKS = (0, 1, 2, 5, 30, 4094, 4095, 4096, 4097, 2**31)
-TIMES = (-(2**31), -1, 2**31 - 1, 2**31, 2**32 - 1)
-
-
 def frames(head, count):
     return b"".join(head.frame(flags=k & 15) for k in range(count))
 
 
 def event(head, random):
-    """The bytes on the wire of an event."""
     number = random.randrange(201)
     events = (
         lambda: frames(head, 1 + number % 40),
-        lambda: head.frame(ahead=random.choice(SKIPS)),
-        lambda: head.frame(ahead=-random.choice(BACKS)),
-        lambda: head.frame(later=random.choice(TIMES)),
+        lambda: head.frame(ahead=random.choice((2, 3, 50, 4095, 4096, 4097, 2**31 - 1, 2**31))),
+        lambda: head.frame(ahead=-random.choice((0, 1, 2, 5, 30, 4094, 4095, 4096, 4097, 2**31))),
+        lambda: head.frame(later=random.choice((-(2**31), -1, 2**31 - 1, 2**31, 2**32 - 1))),
         lambda: flip_bits(head.frame(), number, random.randrange(1, 256)),
         lambda: head.frame()[:number],
         lambda: head.frame()[number:],

@@ -20,15 +20,7 @@ from robot.drivers.head import usb_protocol as wire
 from robot.drivers.head.decoder import Decoder, DecoderCounts, SequenceUnwrapper
 from robot.drivers.head.device import Bridge, Disconnected, HeadIdentity, Stalled, open_bridge
 from robot.drivers.head.driver_config import Address, HeadLinkConfig
-from robot.drivers.head.usb_protocol import (
-    ENDPOINT_IN,
-    ENDPOINT_OUT,
-    REQUEST_IN,
-    REQUEST_OUT,
-    Command,
-    Request,
-    pack_frames,
-)
+from robot.drivers.head.usb_protocol import Command, Request, pack_frames
 from tactile.base.errors import InputError
 from tests.robot.drivers.head import oracle
 from tests.robot.drivers.head.memory import MemoryHead
@@ -49,7 +41,6 @@ def samples(frames):
 
 
 def stream(count, first=0):
-    """Frames in order, 500 us apart."""
     number = first + np.arange(count)
     return pack_frames(number, 500 * number, np.zeros(count), np.full((count, 18, 3), 7, np.int16))
 
@@ -193,13 +184,12 @@ usb = pytest.importorskip("usb.core", reason="pyusb is not installed")
 
 @pytest.fixture
 def device(monkeypatch):
-    """A pyusb device whose transfers succeed."""
     import usb.util
 
     monkeypatch.setattr(usb.util, "claim_interface", lambda device, number: None)
     device = Mock()
     device.read.return_value = array("B", b"abc")
-    device.ctrl_transfer.side_effect = lambda kind, *_: array("B", bytes(8)) if kind == REQUEST_IN else 0
+    device.ctrl_transfer.side_effect = lambda kind, *_: array("B", bytes(8)) if kind == wire.REQUEST_IN else 0
     return device
 
 
@@ -211,10 +201,10 @@ def test_transfers(device):
     assert bridge.request(Request.START) == b""
     assert device.mock_calls == [
         call.get_active_configuration(),  # a configured device is not configured again
-        call.read(ENDPOINT_IN, 4096, 20),
-        call.write(ENDPOINT_OUT, b"command", 500),
-        call.ctrl_transfer(REQUEST_IN, Request.CLOCK, 0, 0, 8, 500),
-        call.ctrl_transfer(REQUEST_OUT, Request.START, 0, 0, b"", 500),
+        call.read(wire.ENDPOINT_IN, 4096, 20),
+        call.write(wire.ENDPOINT_OUT, b"command", 500),
+        call.ctrl_transfer(wire.REQUEST_IN, Request.CLOCK, 0, 0, 8, 500),
+        call.ctrl_transfer(wire.REQUEST_OUT, Request.START, 0, 0, b"", 500),
     ]
     device.get_active_configuration.side_effect = usb.USBError("none", None, errno.ENOENT)
     Bridge(device, "here")
@@ -242,11 +232,11 @@ def test_translation_of_usb_errors(device, kind, name):
     ):
         with pytest.raises(kind) if refused else nullcontext():
             assert action() == b""
-    cleared = [ENDPOINT_IN, ENDPOINT_OUT] if kind is Stalled and not late else []
+    cleared = [wire.ENDPOINT_IN, wire.ENDPOINT_OUT] if kind is Stalled and not late else []
     assert device.clear_halt.mock_calls == [call(endpoint) for endpoint in cleared]
 
 
-def test_addresses():
+def test_addresses_and_no_head_at_one():
     for text, address in (
         ("usb", Address()),
         ("usb:1d50:60a1", Address(0x1D50, 0x60A1)),
@@ -259,9 +249,6 @@ def test_addresses():
     for text in ("", "usb:", "usb:12:34", "usb:1209:0001:", "host:port", "host:70000", "a b", "usbx"):
         with pytest.raises(ValueError, match="not an address of a head"):
             HeadLinkConfig(address=text)
-
-
-def test_no_head_at_an_address():
     with pytest.raises(Disconnected, match=r"127\.0\.0\.1:9"):
         open_bridge("127.0.0.1:9")
     with pytest.raises((Disconnected, InputError)):  # with a real libusb: no head or no permission

@@ -40,7 +40,6 @@ def process(loopback, tmp_path_factory):
 
 @pytest.fixture
 def head(process):
-    """A connected head without faults."""
     process(do="plug")
     return process
 
@@ -59,7 +58,6 @@ def device(head):
 
 @contextmanager
 def usb_error(number):
-    """Checks that pyusb raises the error of this number."""
     with pytest.raises(core.USBError) as caught:
         yield
     assert caught.value.errno == number
@@ -70,7 +68,6 @@ def start(device):
 
 
 def read(device, count, decoder):
-    """Reads 4 KiB at a time until there are `count` more frames."""
     count += decoder.counts.good
     while decoder.counts.good < count:
         decoder.feed(device.read(ENDPOINT_IN, 4096, 30_000).tobytes())
@@ -255,7 +252,6 @@ def whisk(host, mode, rcp):
 
 @pytest.mark.parametrize("rcp", ["head", pytest.param("host", marks=pytest.mark.soak)])
 def test_feedback_reduces_amplitudes_on_contact(rcp, loopback, head):
-    """On the host it fails if the host is late."""
     angle, bent, fed = whisk(loopback, "open", "head")
     assert angle.max() == pytest.approx(np.radians(65), abs=0.02)
     touched = bent > 0.1

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -26,8 +27,7 @@ PATIENT = HeadLinkConfig(silence=30.0, patience=60.0)
 """Limits for tests that lose no data on a busy machine."""
 DRIVE = Command(CommandKind.DRIVE, FeedbackMode.RCP, 1.0, 1.0)
 CENTRE = Command(CommandKind.CENTRE, numbers=np.array([3, 4], np.int16))
-LIMIT = 1000
-"""Of the deflection, in counts."""
+LIMIT = 1000  # of the deflection, counts
 
 
 def amplitudes(number):
@@ -187,11 +187,7 @@ def test_a_hanging_thread_is_detected(head, quick_reader):
 
 def test_an_exception_in_the_thread_is_a_fault(head, reader, monkeypatch):
     monkeypatch.setattr(threading, "excepthook", lambda arguments: None)  # the error is expected
-
-    def broken(frames, arrival):
-        raise RuntimeError("a listener's bug")
-
-    reader.listeners.append(broken)
+    reader.listeners.append(Mock(side_effect=RuntimeError("a listener's bug")))
     head.send(0)
     assert "a listener's bug" in until(lambda: reader.fault).detail
     until(lambda: reader.state == LinkState.CLOSED)
@@ -210,10 +206,7 @@ def watcher(*alive):
     return OverloadDetector(LIMIT * ANGLE, np.array(alive or (True, True)))
 
 
-PAIR = st.tuples(*[st.sampled_from([0, 999, 1000, -1000])] * 2)
-
-
-@given(st.lists(PAIR, max_size=30), st.data())
+@given(st.lists(st.tuples(*[st.sampled_from([0, 999, 1000, -1000])] * 2), max_size=30), st.data())
 def test_overload_does_not_depend_on_the_blocks(rows, data):
     values = np.zeros((len(rows), 2, 3), np.int16)
     values[:, :, 2] = np.array(rows, np.int16).reshape(-1, 2)
@@ -246,7 +239,6 @@ BLOCKS = st.lists(st.lists(st.integers(-40, 40), max_size=8, unique=True), max_s
 
 @given(BLOCKS, st.integers(0, 60), st.integers(0, 40))
 def test_the_window_holds_the_newest_frames(blocks, first, length):
-    """A block holds steps about the highest number so far."""
     window, stored, highest = FrameWindow(1), [], 2**32
     assert window.newest is None
     for k, block in enumerate(blocks):
@@ -317,7 +309,6 @@ def test_host_feedback_follows_the_whisking_law(mode, cuts, whisker, bend):
     for block in blocks(frames, sorted(cuts)):
         amplitudes = host.amplitudes(block)
         sent += [] if amplitudes is None else [amplitudes]
-
     drive = initial_drive(18)
     for k in range(900):
         y = frames.values[k, :, 2] * ANGLE - REST

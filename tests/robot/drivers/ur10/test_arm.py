@@ -23,18 +23,13 @@ TARGET = HOME + [0.01, 0.02, 0.0, 0.0, 0.0, 0.0]
 
 
 def start_move(arm, controller):
-    """Starts a move and waits for full speed."""
     arm.move(AWAY)
     until(lambda: arm.fault or controller.state()["speed"][0] > 0.049, "the arm moves")
     assert arm.fault is None
 
 
 def check_stop(arm, controller, within=PATIENCE):
-    """Checks that a fault stops the arm before its target and that moves are refused; returns the outcome.
-
-    Args:
-        within: longest time from the fault to the standstill, s.
-    """
+    """Checks that a fault stops the arm in `within` s, before its target, for good; returns the outcome."""
     fault = until(lambda: arm.fault, "a fault")
     until(lambda: not controller.state()["moving"], "a standstill", within)
     place = controller.state()["tcp"]
@@ -48,7 +43,6 @@ def check_stop(arm, controller, within=PATIENCE):
 
 
 def test_a_move_arrives(arm, controller):
-    """Also one to the present pose."""
     first = len(controller.state()["targets"])
     assert not arm.arrived()
     arm.move(HOME)
@@ -184,7 +178,6 @@ def test_a_collision_with_a_wall(controller):
         assert check_stop(arm, controller) is SessionOutcome.CONTACT
         assert controller.state()["penetration_max"] <= 0.003
         assert controller.state()["safety"] == "NORMAL"
-        # The tool backs off along its path: out of the wall, at most by `backoff`.
         until(lambda: controller.state()["tcp"][0] < at - 0.006, "the tool backs off")
         until(arm.still)
         assert at - 0.0105 < controller.state()["tcp"][0]
@@ -224,7 +217,6 @@ time.sleep(600)
 
 
 def runs(pid):
-    """Whether a process runs; a zombie does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):

@@ -16,10 +16,8 @@ from robot.world.arena import Arena
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
-CORNERS = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
-ROOM = Arena("room", CORNERS, (), np.array([1.0, 1.0, 0.0]))
+ROOM = Arena("room", 2.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), (), np.array([1.0, 1.0, 0.0]))
 BODY = 0.17
-EXACT = CreateWorldConfig(wheels=WheelsConfig(noise="none"))
 
 
 def robot_in(world, arena=ROOM, seed=0):
@@ -35,7 +33,7 @@ def move(robot, right, left, seconds):
 
 
 def test_a_wall_stops_the_body_and_presses_the_bumper_while_the_wheels_slip():
-    robot = robot_in(EXACT)
+    robot = robot_in(CreateWorldConfig(wheels=WheelsConfig(noise="none")))
     move(robot, 200, 200, 10.0)
     assert robot.base.x == pytest.approx(2.0 - BODY, abs=0.003)
     assert robot.bumps == Bumps.BUMPED
@@ -67,7 +65,6 @@ def test_odometry_has_one_error_for_the_whole_session():
 
 
 def test_the_strain_is_that_of_the_simulator():
-    """Within the resolution of the samples."""
     config = WhiskersConfig(noise=0.0, shake={"start": 0.0, "rumble": 0.0})
     world = CreateWorldConfig(whiskers=config)
     robot = robot_in(world, ROOM._replace(start=np.array([1.75, 1.0, 0.3])))

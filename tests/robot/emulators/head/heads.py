@@ -27,11 +27,9 @@ def drive(mode=FeedbackMode.RCP, threshold=0.04, **changes):
 
 
 open_drive = partial(drive, FeedbackMode.OPEN)
-"""A whisk without feedback."""
 
 
 def world(config):
-    """The scene of a configuration."""
     head = ur10_head(config.head)
     return make_scene(config.maze, config.path, config.motion, KidnapConfig(), head, config.seed)
 
@@ -47,14 +45,12 @@ class HostedHead:
         self.decoder, self.now = Decoder(self.whiskers.count, 3), 0.0
 
     def start(self, *commands):
-        """Starts the stream of frames and sends commands."""
         self.bridge.control(wire.REQUEST_OUT, wire.Request.START, 0, 0, self.now)
         for command in commands:
             self.send(command)
         return self
 
     def stop(self):
-        """Stops the stream of frames."""
         self.bridge.control(wire.REQUEST_OUT, wire.Request.STOP, 0, 0, self.now)
 
     def send(self, command):
@@ -74,16 +70,11 @@ class HostedHead:
         return self.decoder.feed(b"".join(got))
 
     def read(self, later=0.0):
-        """All bytes that are queued, read some seconds later."""
         return self.bridge.bulk_in(10**9, self.now + later)
 
-    def angles(self, seconds):
-        """Advances time by some seconds; angles [N, whiskers] of the frames read."""
-        return wire.to_radians(self.pass_by(seconds).values)[0]
-
-    def deflections(self, seconds):
-        """Advances time by some seconds; deflections [N, whiskers, 2] of the frames read."""
-        return wire.to_radians(self.pass_by(seconds).values)[1]
+    def readings(self, seconds):
+        """Advances time; angles [N, whiskers] and deflections [N, whiskers, 2] of the frames read."""
+        return wire.to_radians(self.pass_by(seconds).values)
 
     def do(self, fault, **arguments):
         return self.bridge.do({"do": fault, **arguments}, self.now)

@@ -1,8 +1,7 @@
 """The real client libraries against the emulator, or against a real controller.
 
 `RATSLAM_UR_HOST=192.168.56.101 pytest tests/robot/emulators/ur10/test_clients.py` runs the test of moves on
-that controller (or the vendor's simulator). It moves the tool 20 mm upwards from its present pose: leave it
-room.
+that controller. It moves the tool 20 mm upwards from its present pose: leave it room.
 
 `python -m tests.robot.emulators.ur10.test_clients HOST` has the libraries in its own process; they may crash.
 Each line of input is a call as JSON: the library's part (`PARTS`), the method, its arguments; `a.b`
@@ -76,9 +75,7 @@ def test_all_four_clients_of_ur_rtde_work_with_every_version(loopback, hz, polys
             assert call("control", "isPoseWithinSafetyLimits", pose)
             assert not call("control", "isPoseWithinSafetyLimits", [5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
             call("io", "setSpeedSlider", 0.25)
-            until(
-                lambda: call("receive", "getTargetSpeedFraction") == pytest.approx(0.25), "the slider is set"
-            )
+            until(lambda: call("receive", "getTargetSpeedFraction") == pytest.approx(0.25))
             call("control", "setTcp", [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
             lower = pytest.approx(pose[2] - 0.1, abs=1e-9)
             until(lambda: call("receive", "getActualTCPPose")[2] == lower, "the tool is lowered")

@@ -17,19 +17,16 @@ SCANS = [scan(time, np.arange(1, 19) * 0.25, -1.5, 3.0 / 18) for time in TIMES]
 
 
 def link(parent, child, yaw=0.0, x=0.0, topic="/tf_static"):
-    """A transform that is told once."""
     return tf(START, transform(START, parent, child, x, 0.0, quaternion(yaw)), topic=topic)
 
 
 def framed(parent, child, path=PATH, times=TIMES):
-    """A frame that follows a path, on /tf."""
     rows = zip(times, path.tolist(), strict=True)
     return [tf(time, transform(time, parent, child, x, y, quaternion(yaw))) for time, (x, y, yaw) in rows]
 
 
 def opened(path, told=None, **settings):
-    """Reads a bag with these topics (`odometry` is /odom unless given) and other settings; warnings are
-    appended to `told`."""
+    """Reads a bag with these topics and other settings; warnings are appended to `told`."""
     other = {key: settings.pop(key) for key in ("image", "visual_odometry", "to") if key in settings}
     recording = {"file": path, "topics": {"odometry": "/odom"} | settings} | other
     return open_recording(RecordingConfig.model_validate(recording), None if told is None else told.append)

@@ -51,9 +51,8 @@ MISSING = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", MISSING)
-def test_missing_topics_are_named_with_those_that_exist(case, write, refused):
-    topics, pieces = MISSING[case]
+@pytest.mark.parametrize(("topics", "pieces"), MISSING.values(), ids=MISSING.keys())
+def test_missing_topics_are_named_with_those_that_exist(topics, pieces, write, refused):
     path = write(WHEELS, SCANS, [Entry("/lab", "lab_msgs/msg/Custom", TIMES[-1], {})])
     refused(lambda: opened(path, **topics), *pieces)
     refused(lambda: open_recording(RecordingConfig(file=path)), "recording.topics: no odometry", "/odom (nav")
@@ -77,9 +76,8 @@ STAMPS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", STAMPS)
-def test_one_disorder_is_left_out_and_more_are_cured_by_the_bag_time(case, write, refused):
-    make, pieces = STAMPS[case]
+@pytest.mark.parametrize(("make", "pieces"), STAMPS.values(), ids=STAMPS.keys())
+def test_one_disorder_is_left_out_and_more_are_cured_by_the_bag_time(make, pieces, write, refused):
     path, told = write(with_stamps(make(2)), kind="sqlite3"), []
     refused(lambda: opened(path), *pieces, "(so in 2 of 12", "--set recording.topics.clock=bag")
     assert opened(path, clock="bag").length == 12
@@ -123,7 +121,6 @@ def test_a_velocity_does_not_hold_over_a_gap(leaping, write, refused):
 
 @pytest.mark.parametrize("other", [("odom", "chassis"), ("map", "base_link"), ("odom", "foot")])
 def test_several_publishers_are_named_and_chosen(other, write, refused):
-    """Poses that agree, those of a foot beside those of the base, are only told."""
     agree = other == ("odom", "foot")
     one = renamed([odometry(time, 0.1 * row, 0, 0) for row, time in enumerate(TIMES)], "odom", "base_link")
     side = 0.0 if agree else 0.5
@@ -207,7 +204,6 @@ def test_empty_and_cut_bags_are_refused(write, tmp_path, refused):
 
 
 def test_the_parts_of_a_bag_are_one_recording(write, tmp_path):
-    """Of ROS 1 in a folder; a storage file without its folder, compressed messages included."""
     (tmp_path / "parts").mkdir()
     for number, part in enumerate((SCANS[6:] + WHEELS[6:], SCANS[:6] + WHEELS[:6])):
         shutil.move(write(part, kind="ros1"), tmp_path / "parts" / f"{number}.bag")
@@ -255,7 +251,6 @@ def test_an_mcap_is_read_whole_whatever_its_index(case, write, tmp_path):
 
 @pytest.mark.parametrize("fan", [False, True])
 def test_two_lasers_on_one_topic_have_their_own_mounts(fan, write):
-    """One looks ahead, the other back; an unknown mount is told once."""
     front, rear = [link("base_link", "laser")], [link("base_link", "rear", np.pi)]
     ranges, scans = np.linspace(1, 4, 36), []
     for row, time in enumerate(TIMES):

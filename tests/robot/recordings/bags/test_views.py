@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from robot.recordings.bags import views
 from robot.recordings.bags.bag_description import describe_bag
 from robot.recordings.bags.transforms import Mount
-from robot.recordings.bags.views import (
-    COMPRESSED,
-    RAW,
-    Extent,
-    cloud_view,
-    grey_image,
-    scan_view,
-    wider_extent,
-)
+from robot.recordings.bags.views import COMPRESSED, RAW, Extent, cloud_view, scan_view
 from tests.helpers.ros_bags import ROS2, Entry, built, header, image, odometry, scan
 from tests.robot.recordings.bags.conftest import opened
 
@@ -46,7 +39,6 @@ def test_a_fan_keeps_groups_of_consecutive_beams():
 
 
 def test_a_ring_runs_counter_clockwise():
-    """Also of a scan that runs clockwise, and of a sensor upside down."""
     step = 2 * np.pi / 8
     assert sectors(message([1, 2, 2, 3, 3, 4, 4, 1], step / 2, -step), 4) == [0.75, 0.5, 0.25, 1.0]
     ranges = np.full(360, 4.0)
@@ -58,7 +50,6 @@ def test_a_ring_runs_counter_clockwise():
 @pytest.mark.parametrize("first", [0.0, -np.pi])
 @pytest.mark.parametrize("yaw", [0.0, 0.5 * np.pi, np.pi])
 def test_a_ring_begins_behind_the_robot(first, yaw):
-    """Something near is a little to the right of behind, another thing ahead on the left."""
     step = 2 * np.pi / 360
     angles = first + step * np.arange(360) + yaw  # in the frame of the robot
     direction = (angles + np.pi) % (2 * np.pi)
@@ -92,7 +83,6 @@ def test_beams_go_to_sectors_by_direction(case):
 
 
 def test_a_part_of_a_ring_has_the_sectors_of_the_ring():
-    """Where it has no beams, the sectors are between their neighbours'."""
     step = 2 * np.pi / 36
     whole = np.repeat([1.0, 2.0, 3.0, 2.0], 9)
     shared = Extent(0.0, 2 * np.pi, step)
@@ -105,12 +95,12 @@ def test_a_part_of_a_ring_has_the_sectors_of_the_ring():
 
 def test_the_span_of_scans_is_what_they_cover_together():
     first = Extent(0.0, -1.0, 0.01)
-    assert wider_extent([first, Extent(2 * np.pi + 0.001, 1.0, 0.01)]) is None
-    wider = wider_extent([first, Extent(0.2, 1.0, 0.01), Extent(-0.1, 0.2, 0.01)])
+    assert views.wider_extent([first, Extent(2 * np.pi + 0.001, 1.0, 0.01)]) is None
+    wider = views.wider_extent([first, Extent(0.2, 1.0, 0.01), Extent(-0.1, 0.2, 0.01)])
     assert wider.span == pytest.approx((0.7, -0.5))
-    ring = wider_extent([Extent(0.0, 4.0, 0.01), Extent(np.pi, 4.0, 0.01)])
+    ring = views.wider_extent([Extent(0.0, 4.0, 0.01), Extent(np.pi, 4.0, 0.01)])
     assert ring.span == (-np.pi, np.pi)
-    assert wider_extent([first, first, Extent(3.0, 1.0, 0.01)]) is None  # most cover a part of it
+    assert views.wider_extent([first, first, Extent(3.0, 1.0, 0.01)]) is None  # most cover a part of it
 
 
 def test_beams_without_a_measurement_do_not_count():
@@ -125,12 +115,6 @@ def test_beams_without_a_measurement_do_not_count():
     step = 2 * np.pi / 8
     ring = message([np.nan, 1, 0.05, 2, np.inf, 4, 90, 4], -np.pi + step / 2, step, range_min=0.1)
     assert sectors(ring, 4) == pytest.approx([0.25, 0.5, 1.0, 1.0])
-
-
-def test_angles_that_are_no_numbers_are_refused(refused):
-    refused(lambda: sectors(message([1, 3], np.nan, 0.1), 2), "here", "angle_min is nan", "angles in rad")
-    refused(lambda: sectors(message([1, 3], 0.0, 0.0), 2), "angle_increment 0.0")
-    refused(lambda: sectors(message([1, 3], 0.0, 0.1), 3), "2 beams", "each of 3 sectors")
 
 
 FIELDS = [{"name": name, "offset": 4 * k, "datatype": 7, "count": 1} for k, name in enumerate("xyz")]
@@ -153,19 +137,20 @@ def test_a_cloud_is_the_nearest_point_of_each_degree(order):
     near = {0: 1.0 / 4, 180 + int(np.rad2deg(np.arctan2(0.5, 2))): np.hypot(2, 0.5) / 4}
     assert {int(i): view.pixels[i] for i in np.flatnonzero(view.pixels < 1)} == pytest.approx(near, rel=1e-4)
     # Mounted 0.3 m high, to the left: its x axis is the robot's y axis.
-    mount, points = (
-        turned(np.pi / 2)._replace(position=np.array([0, 0, 0.3])),
-        np.array([[1, 0, 0], [2, 0, -0.25]]),
-    )
+    mount = turned(np.pi / 2)._replace(position=np.array([0, 0, 0.3]))
+    points = np.array([[1, 0, 0], [2, 0, -0.25]])
     view = cloud_view(cloud(points, order), mount, (0.1, 1.0), 4, 4.0, "here")
     assert np.flatnonzero(view.pixels < 1).tolist() == [3]
     assert view.lowest == pytest.approx(1.0)
 
 
-def test_a_damaged_cloud_is_refused(refused):
+def test_damaged_scans_and_clouds_are_refused(refused):
     def read(content):
         return cloud_view(content, AHEAD, (0.1, 1.0), 4, 4.0, "here")
 
+    refused(lambda: sectors(message([1, 3], np.nan, 0.1), 2), "here", "angle_min is nan", "angles in rad")
+    refused(lambda: sectors(message([1, 3], 0.0, 0.0), 2), "angle_increment 0.0")
+    refused(lambda: sectors(message([1, 3], 0.0, 0.1), 3), "2 beams", "each of 3 sectors")
     refused(lambda: read(cloud(POINTS, fields=[])), "here", "a cloud of no fields", "fields x, y and z")
     refused(lambda: read(cloud(POINTS, width=50)), "1 x 50 points", "data that fit")
     odd = [field | {"datatype": 99} for field in FIELDS]
@@ -178,7 +163,6 @@ GREY = np.asarray(Image.fromarray(COLOUR).convert("L"))
 
 
 def raw(pixels, encoding, padding=0, **fields):
-    """A raw image whose rows end with some bytes of padding."""
     rows = np.frombuffer(np.ascontiguousarray(pixels).tobytes(), np.uint8).reshape(len(pixels), -1)
     data = np.pad(rows, ((0, 0), (0, padding)), constant_values=7)
     given = {"step": data.shape[1], "data": data.reshape(-1)} | fields
@@ -200,7 +184,7 @@ def compressed(pixels, kind, **options):
 
 
 def grey_of(content):
-    return grey_image(content, COMPRESSED if hasattr(content, "format") else RAW, "here")
+    return views.grey_image(content, COMPRESSED if hasattr(content, "format") else RAW, "here")
 
 
 DEEP = GREY.astype(int) * 256 + 77
@@ -226,9 +210,8 @@ for kind, away, options in (("PNG", 0, {}), ("WebP", 1, {"lossless": True}),
 """Images, and how far their grey levels may be from those of Pillow."""
 
 
-@pytest.mark.parametrize("case", READABLE)
-def test_images_become_grey(case):
-    content, away = READABLE[case]
+@pytest.mark.parametrize(("content", "away"), READABLE.values(), ids=READABLE.keys())
+def test_images_become_grey(content, away):
     grey = grey_of(content)
     assert grey.dtype == np.uint8
     assert np.abs(grey.astype(int) - GREY).max() <= away

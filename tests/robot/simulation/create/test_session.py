@@ -1,14 +1,9 @@
 """Sessions of the Create: reproducibility, statistics; state machine; errors of wheel odometry."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from jax import tree
 from pydantic import ValidationError
 
 from robot.simulation.create import simulated_session as simulated
@@ -16,18 +11,18 @@ from robot.simulation.create import state_machine as machine
 from robot.simulation.create.simulated_session import CreateSimulation, CreateSimulationConfig
 from robot.simulation.create.state_machine import BehaviourConfig, CreateState, MachineState, motion_end
 from robot.simulation.create.wheel_odometry import WheelsConfig, simulate_wheel_odometry
-from robot.sources.source import Source
 from robot.world.arena import arena_text, wall_segments
 from robot.world.walls import segment_distance
-from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import between, compose, integrate, wrap
 from tactile.base.types import MotionKind, Report, StepEnd
+from tests.robot.conftest import bits
 
+CONFIG, ROWS, NONE = BehaviourConfig(), 40, np.zeros(4, bool)
 FWD1, FWD2, BACK, TURN = CreateState.FWD1, CreateState.FWD2, CreateState.BACK, CreateState.TURN
 
 
-def simulate(**changes: Any) -> CreateSimulation:
+def simulate(**changes: object) -> CreateSimulation:
     return CreateSimulation(CreateSimulationConfig.model_validate({"reports": 60} | changes))
 
 
@@ -35,18 +30,13 @@ def column(simulation: CreateSimulation, name: str) -> np.ndarray:
     return np.array([getattr(step, name) for step in simulation.steps])
 
 
-def bits(source: Source) -> list[list[bytes]]:
-    return [[np.asarray(leaf).tobytes() for leaf in tree.leaves(sample)] for sample in source]
-
-
-def test_a_seed_gives_the_same_session_for_ever_and_the_beginning_of_a_longer_one() -> None:
+def test_a_seed_gives_the_same_session_for_ever_and_the_beginning_of_a_longer_one():
     made, longer, other = simulate(), simulate(reports=80), simulate(seed=1)
-    assert isinstance(made, Source)
     with made as source:
-        first = bits(source)
-        assert bits(source) == first
-    assert bits(longer)[:60] == first
-    assert len(first) == made.length == 60
+        first = bits([*source])
+        assert bits([*source]) == first
+    assert bits([*longer][:60]) == first
+    assert made.length == 60
     assert len({source.digest for source in (made, longer, other)}) == 3
     state, moment = ("".join(str(int(one)) for one in column(made, name)) for name in ("state", "moment"))
     assert state == 35 * "0" + "1233323233301233333333333"
@@ -58,7 +48,7 @@ def test_a_seed_gives_the_same_session_for_ever_and_the_beginning_of_a_longer_on
     np.testing.assert_allclose(strain, [0.000202554, 3.26076e-05], rtol=1e-5)
 
 
-def test_streams_are_independent_and_the_digest_depends_on_the_configuration(tmp_path: Path) -> None:
+def test_streams_are_independent_and_the_digest_depends_on_the_configuration(tmp_path):
     base, other = simulate(), simulate(wheels={"noise": "bias"})
     assert (other.odometry != base.odometry).any()
     assert (other.truth == base.truth).all()
@@ -85,7 +75,7 @@ def test_streams_are_independent_and_the_digest_depends_on_the_configuration(tmp
     assert arena_text(filed.arena) == arena_text(room)
 
 
-def test_samples_agree_with_the_session() -> None:
+def test_samples_agree_with_the_session():
     simulation = simulate(minutes=1.0, reports=None)
     samples = list(simulation)
     assert len(samples) == simulation.length
@@ -116,7 +106,7 @@ def test_samples_agree_with_the_session() -> None:
 
 
 @pytest.mark.parametrize(("seed", "side"), [(0, 1.25), (2, 2.5)])
-def test_steps_end_as_they_should_and_the_body_stays_out_of_walls(seed: int, side: float) -> None:
+def test_steps_end_as_they_should_and_the_body_stays_out_of_walls(seed, side):
     simulation = simulate(seed=seed, arena={"side": side}, reports=250)
     state, moment, contact = (column(simulation, name) for name in ("state", "moment", "contact"))
     assert contact[moment == StepEnd.HIT1].any(axis=1).all()
@@ -131,7 +121,7 @@ def test_steps_end_as_they_should_and_the_body_stays_out_of_walls(seed: int, sid
 
 
 @pytest.mark.soak
-def test_six_minutes_have_the_statistics_of_the_paper() -> None:
+def test_six_minutes_have_the_statistics_of_the_paper():
     """30 contacts or more, some without a second contact, in 3 to 4 anticlockwise circuits."""
     counts = []
     for seed in range(12):
@@ -153,7 +143,7 @@ def test_six_minutes_have_the_statistics_of_the_paper() -> None:
     assert stuck.max() < 60
 
 
-def test_dead_whiskers_never_report_and_odometry_without_noise_integrates_to_the_truth() -> None:
+def test_dead_whiskers_never_report_and_odometry_without_noise_integrates_to_the_truth():
     simulation = simulate(whiskers={"dead": [0, 3]})
     assert not column(simulation, "contact")[:, [0, 3]].any()
     assert next(iter(simulation)).reading.alive.tolist() == [False, True, True, False]
@@ -165,12 +155,12 @@ def test_dead_whiskers_never_report_and_odometry_without_noise_integrates_to_the
     assert np.abs(np.column_stack([off[:, :2], wrap(off[:, 2])])).max() < 1e-9
 
 
-def into(angle_deg: float, **changes: Any) -> Report:
+def into(angle_deg: float, **changes: object) -> Report:
     config = CreateSimulationConfig.model_validate(changes)
     return simulated.drive_into_wall(config, np.radians(angle_deg), stream(0, "templates"))
 
 
-def test_first_contact_with_a_wall_is_at_its_position(refused: Callable[..., InputError]) -> None:
+def test_first_contact_with_a_wall_is_at_its_position(refused):
     for angle, first in ((20, [3]), (50, [3]), (60, [1, 2]), (90, [1, 2]), (130, [0])):
         report = into(angle)
         assert report.strain.shape == (4000, 4, 2)
@@ -178,7 +168,6 @@ def test_first_contact_with_a_wall_is_at_its_position(refused: Callable[..., Inp
         # [20, 4] horizontal strain without vibration: means over a tenth of a second.
         level = np.abs(report.strain[..., 0].reshape(-1, 200, 4).mean(axis=1))
         assert level[0].argmax() in first
-        # Samples are aligned at contact: strain grows from the first one.
         assert 1.5e-4 < level[0].max() < 8e-4
         assert level[-1].max() > 2 * level[0].max()
     for angle in (0, 180, 270):
@@ -188,22 +177,15 @@ def test_first_contact_with_a_wall_is_at_its_position(refused: Callable[..., Inp
     refused(lambda: into(90, behaviour=numb), "create_simulation.behaviour.contact")
 
 
-# The state machine
-
-CONFIG, ROWS, NONE = BehaviourConfig(), 40, np.zeros(4, bool)
-
-
 def quiet() -> np.ndarray:
     return np.zeros((ROWS, 4, 2))
 
 
-def end_of(
-    state: CreateState, strain: np.ndarray, bumped: int = ROWS, before: np.ndarray = NONE
-) -> tuple[int, StepEnd] | None:
+def end_of(state, strain, bumped=ROWS, before=NONE) -> tuple[int, StepEnd] | None:
     return motion_end(CONFIG, state, strain, np.arange(ROWS) >= bumped, before, ROWS - 1)
 
 
-def test_transitions() -> None:
+def test_transitions():
     for state, moment, then in (
         (FWD1, StepEnd.FREE, FWD1), (FWD1, StepEnd.HIT1, FWD2), (FWD1, StepEnd.ABORT, BACK),
         (FWD2, StepEnd.HIT2, BACK), (FWD2, StepEnd.ABORT, BACK), (BACK, StepEnd.FREE, TURN),
@@ -213,7 +195,7 @@ def test_transitions() -> None:
         assert (doing.state, doing.rest != 0) == (then, then == TURN)
 
 
-def test_a_turn_is_made_in_steps_that_add_up() -> None:
+def test_a_turn_is_made_in_steps_that_add_up():
     random = stream(0, "behaviour")
     for _ in range(50):
         doing = machine.next_state(CONFIG, MachineState(BACK), StepEnd.FREE, 0.0, random)
@@ -228,11 +210,8 @@ def test_a_turn_is_made_in_steps_that_add_up() -> None:
         assert doing.state == FWD1
         assert total == pytest.approx(whole, abs=1e-5)
         assert steps == max(1, int(np.ceil(abs(whole) / 0.15 - 1e-4)))
-    once = machine.wheel_command(
-        BehaviourConfig(turn=machine.TurnConfig(step=None)), MachineState(TURN, -1.2)
-    )
-    assert once == machine.WheelCommand(0.0, -0.3, pytest.approx(4.0))
-    # Speeds and durations are those of the paper.
+    once = BehaviourConfig(turn=machine.TurnConfig(step=None))
+    assert machine.wheel_command(once, MachineState(TURN, -1.2)) == (0.0, -0.3, pytest.approx(4.0))
     assert machine.wheel_command(CONFIG, MachineState(FWD1)) == (0.05, 0.0, 0.5)
     assert machine.wheel_command(CONFIG, MachineState(BACK)) == (-0.05, 0.0, 0.5)
     assert machine.wheel_command(CONFIG, MachineState(FWD2))[:2] == (0.02, 0.0)
@@ -242,12 +221,11 @@ def test_a_turn_is_made_in_steps_that_add_up() -> None:
 
 def draw_turns(**changes: object) -> np.ndarray:
     config, random = BehaviourConfig(turn=machine.TurnConfig.model_validate(changes)), stream(1, "behaviour")
-    return np.array(
-        [machine.next_state(config, MachineState(BACK), StepEnd.FREE, 0.0, random).rest for _ in range(4000)]
-    )
+    ended = MachineState(BACK), StepEnd.FREE, 0.0
+    return np.array([machine.next_state(config, *ended, random).rest for _ in range(4000)])
 
 
-def test_turns_are_drawn_from_the_two_gaussians() -> None:
+def test_turns_are_drawn_from_the_two_gaussians():
     angles = draw_turns(share=0.6)
     small = np.isclose(angles, 0.14 * np.pi)
     assert small.mean() == pytest.approx(0.6, abs=0.03)
@@ -259,7 +237,7 @@ def test_turns_are_drawn_from_the_two_gaussians() -> None:
 
 
 @given(st.integers(0, ROWS - 2), st.integers(0, ROWS - 2), st.integers(0, ROWS - 2), st.sampled_from([-1, 1]))
-def test_the_earliest_cause_ends_a_motion(touch: int, over: int, bump: int, sign: int) -> None:
+def test_the_earliest_cause_ends_a_motion(touch, over, bump, sign):
     strain = quiet()
     strain[touch:, 1, 0] = sign * 1.5 * CONFIG.contact
     strain[over:, 2, 0] = sign * 1.5 * CONFIG.safety
@@ -270,19 +248,18 @@ def test_the_earliest_cause_ends_a_motion(touch: int, over: int, bump: int, sign
 
 
 @given(st.integers(0, 3), st.integers(0, 3), st.integers(10, ROWS - 2))
-def test_a_second_contact_needs_another_whisker(first: int, second: int, row: int) -> None:
+def test_a_second_contact_needs_another_whisker(first, second, row):
     strain, before = quiet(), np.arange(4) == first
     strain[:, first, 0] = 2 * CONFIG.contact
     strain[row:, second, 0] = -2 * CONFIG.contact
     expected = (row, StepEnd.HIT2) if second != first else (ROWS - 1, StepEnd.ABORT)
     assert end_of(FWD2, strain, before=before) == expected
-    # Also after the first whisker has slipped off.
     strain[row - 5 :, first] = 0
     strain[row:, second, 0] = -2 * CONFIG.contact
     assert end_of(FWD2, strain, before=before) == expected
 
 
-def test_undisturbed_motions_end_as_planned_and_excessive_strain_aborts() -> None:
+def test_undisturbed_motions_end_as_planned_and_excessive_strain_aborts():
     """But a turn may release a strained whisker, and two contacts at once last the shortest FWD2."""
     for state in CreateState:
         assert end_of(state, quiet()) == (ROWS - 1, (StepEnd.ABORT if state == FWD2 else StepEnd.FREE))
@@ -303,9 +280,7 @@ def test_undisturbed_motions_end_as_planned_and_excessive_strain_aborts() -> Non
 
 
 @given(*[st.floats(-3, 3)] * 3, st.sampled_from([(0.05, 0.0), (-0.05, 0.0), (0.0, 0.3), (0.0, -0.3)]))
-def test_motions_are_straight_or_on_the_spot(
-    x: float, y: float, heading: float, how: tuple[float, float]
-) -> None:
+def test_motions_are_straight_or_on_the_spot(x, y, heading, how):
     pose, time = np.array([x, y, heading]), np.linspace(0.0, 2.0, 9)
     poses = machine.drive(machine.WheelCommand(*how, 2.0), pose, time)
     there = compose(pose, np.column_stack([how[0] * time, 0 * time, how[1] * time]))
@@ -313,16 +288,11 @@ def test_motions_are_straight_or_on_the_spot(
     assert np.allclose(np.exp(1j * poses[:, 2]), np.exp(1j * there[:, 2]))
 
 
-@given(
-    st.sampled_from(list(CreateState)),
-    st.lists(st.sampled_from([0.0, 1.5e-4, 3e-4, 1.9e-3, 2.1e-3]), min_size=6, max_size=6),
-    st.integers(0, ROWS),
-    st.integers(0, ROWS),
-)
-def test_a_motion_ends_at_the_same_row_when_its_rows_come_one_by_one(
-    state: CreateState, levels: list[float], since: int, bumped: int
-) -> None:
-    """The live robot sees a row at a time, the simulated one all of them."""
+LEVELS = st.lists(st.sampled_from([0.0, 1.5e-4, 3e-4, 1.9e-3, 2.1e-3]), min_size=6, max_size=6)
+
+
+@given(st.sampled_from(list(CreateState)), LEVELS, st.integers(0, ROWS), st.integers(0, ROWS))
+def test_a_motion_ends_at_the_same_row_when_its_rows_come_one_by_one(state, levels, since, bumped):
     strain, body = quiet(), np.arange(ROWS) >= bumped
     strain[since:, :3] = np.array(levels[:3])[:, None]
     strain[(since + ROWS) // 2 :, :3] = np.array(levels[3:])[:, None]
@@ -345,7 +315,7 @@ def measured(noise: str, motion: np.ndarray, kind: np.ndarray, seed: int = 0, le
 
 
 @given(st.integers(0, 10**6), st.sampled_from(["white", "move", "bias", "none"]))
-def test_only_moving_parts_have_errors(seed: int, noise: str) -> None:
+def test_only_moving_parts_have_errors(seed, noise):
     motion, kind = drive_and_turn(40)
     found = measured(noise, motion, kind, seed)
     assert (found[motion == 0] == 0).all()
@@ -356,7 +326,7 @@ def test_only_moving_parts_have_errors(seed: int, noise: str) -> None:
     assert measured(noise, motion[:0], kind[:0]).shape == (0, 4)
 
 
-def test_a_seed_gives_the_same_errors_for_ever() -> None:
+def test_a_seed_gives_the_same_errors_for_ever():
     known = {
         "white": [0.59778608, 1.21823274, 0.14835760, 0.16114506],
         "move": [0.58469252, 1.21442510, 0.14835760, 0.14521466],
@@ -368,13 +338,9 @@ def test_a_seed_gives_the_same_errors_for_ever() -> None:
         np.testing.assert_allclose([*found[:, [0, 2]].sum(axis=0), *found[[8, 39], 2]], values, atol=1e-7)
 
 
-# Errors of kind `measured` are those of real Creates, when analysed alike
-
-
 def analyse(seed: int) -> np.ndarray:
-    """Of 75 windows of 10 s, 0.055 m/s ahead with turns of 0.925 rad, as the recordings were analysed: truth
-    over odometry of length and turn, heading drift (rad/s), spread of a window's distance as a share of it,
-    turn residual of a window (rad)."""
+    """Of 75 windows of 10 s, as the recordings were analysed: truth over odometry of length and turn, heading
+    drift (rad/s), spread of a window's distance as a share of it, turn residual of a window (rad)."""
     turn = np.repeat(stream(seed, "drive").choice([-0.0925, 0.0925], 75), 20)
     motion = np.column_stack([np.full(1500, 0.0275), np.zeros(1500), turn / 2, np.full(1500, 0.5)])
     found = measured("measured", motion, np.ones(1500, int), seed)
@@ -385,7 +351,7 @@ def analyse(seed: int) -> np.ndarray:
     return np.array([length, turn, drift, spread, (known @ [turn, drift] - true[:, 2]).std()])
 
 
-def test_measured_errors_are_those_of_real_creates_when_analysed_alike() -> None:
+def test_measured_errors_are_those_of_real_creates_when_analysed_alike():
     """Size: means and deviations of 200 runs within 4.5 standard errors; 0.002 for rounding."""
     length, turn, drift, spread, residual = np.array([analyse(seed) for seed in range(200)]).T
     # Least squares underrates a scale whose regressor errs: turns by 1 + 0.143 squared.

@@ -1,7 +1,5 @@
 """Whiskers among walls: geometry of bending, beam theory, strain sensors; templates of simulated drives."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -27,7 +25,6 @@ LENGTH = FAN.length
 
 
 def arena_and_poses(seed: int) -> tuple[Arena, np.ndarray]:
-    """An arena with rotated objects, and free poses [30, 3] in it, near walls."""
     room, random = make_arena(ArenaConfig(rotated=True), seed % 20), np.random.default_rng(seed)
     poses = random.uniform([0, 0, -np.pi], [1.25, 1.25, np.pi], (1000, 3))
     near = segment_distance(wall_segments(room), poses[:, :2]).min(axis=1) < 0.25
@@ -39,7 +36,6 @@ ONE = FAN._replace(base=np.zeros((1, 2)), direction=np.zeros(1))
 
 
 def each(poses: np.ndarray, walls: np.ndarray) -> Bending:
-    """Bending of whiskers at independent poses."""
     alone = [bend_whiskers(FAN, pose[None], walls, FREE) for pose in poses]
     return Bending(*(np.concatenate(column) for column in zip(*alone, strict=True)))
 
@@ -55,7 +51,7 @@ def lines(poses: np.ndarray, turn: np.ndarray, reach: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=10)
 @given(SEEDS)
-def test_whiskers_bend_by_the_smallest_angle_that_keeps_them_out_of_walls(seed: int) -> None:
+def test_whiskers_bend_by_the_smallest_angle_that_keeps_them_out_of_walls(seed):
     room, poses = arena_and_poses(seed)
     walls, bend = wall_segments(room), each(poses, wall_segments(room))
     whole, held = np.full(bend.turn.shape, LENGTH), bend.turn != 0
@@ -63,7 +59,6 @@ def test_whiskers_bend_by_the_smallest_angle_that_keeps_them_out_of_walls(seed: 
     def blocked(turn: np.ndarray, reach: np.ndarray = whole) -> np.ndarray:
         return segments_cross(lines(poses, turn, reach), walls).any(axis=1).reshape(-1, 4)
 
-    # They bend where the straight shaft would enter a wall.
     assert (held == blocked(0 * bend.turn)).all()
     assert (np.sign(bend.turn) == bend.side).all()
     assert held.sum() > 10
@@ -72,7 +67,6 @@ def test_whiskers_bend_by_the_smallest_angle_that_keeps_them_out_of_walls(seed: 
     assert segment_distance(walls, reached[:, 2:]).min(axis=1).max() < 1e-6
     assert not blocked(bend.turn + 1e-7 * bend.side, bend.reach - 1e-5)[held].any()
     assert (bend.reach <= LENGTH * (1 + 1e-9)).all()
-    # With a smaller turn it would be in a wall, on either side.
     for share in np.linspace(-0.999, 0.999, 8):
         assert blocked(share * bend.turn)[held].all()
     beyond = blocked(bend.turn + 1e-6 * bend.side)
@@ -83,7 +77,7 @@ def test_whiskers_bend_by_the_smallest_angle_that_keeps_them_out_of_walls(seed: 
 
 @settings(max_examples=8)
 @given(SEEDS, *[st.floats(-3, 3)] * 3)
-def test_bending_moves_and_is_mirrored_with_the_walls(seed: int, x: float, y: float, angle: float) -> None:
+def test_bending_moves_and_is_mirrored_with_the_walls(seed, x, y, angle):
     room, poses = arena_and_poses(seed)
     segments, here = wall_segments(room).reshape(-1, 2), each(poses, wall_segments(room))
     c, s = np.cos(angle), np.sin(angle)
@@ -100,8 +94,7 @@ def test_bending_moves_and_is_mirrored_with_the_walls(seed: int, x: float, y: fl
 
 @settings(max_examples=10)
 @given(SEEDS, st.integers(1, 58))
-def test_a_motion_may_be_computed_in_parts(seed: int, cut: int) -> None:
-    """The bending side is the only state."""
+def test_a_motion_may_be_computed_in_parts(seed, cut):
     room, poses = arena_and_poses(seed)
     assume(len(poses) > 0)
     way = poses[0] + np.linspace(0, 1, 60)[:, None] * [0.03, -0.02, 1.5]
@@ -112,7 +105,7 @@ def test_a_motion_may_be_computed_in_parts(seed: int, cut: int) -> None:
         assert (column == np.concatenate([one, two])).all()
 
 
-def test_a_whisker_stays_on_its_side() -> None:
+def test_a_whisker_stays_on_its_side():
     """A wall first straight across, then tilted to the other side."""
     for tip in np.radians(np.linspace(85, 95, 40)):
         wall = np.array([[0.13 - np.cos(tip), -np.sin(tip), 0.13 + np.cos(tip), np.sin(tip)]])
@@ -125,7 +118,7 @@ def test_a_whisker_stays_on_its_side() -> None:
     assert bend_whiskers(ONE, turned[-1:], wall, np.zeros(1, int)).side[0, 0] == -1
 
 
-def test_contact_with_a_tip_and_a_shaft_and_no_wall_in_reach() -> None:
+def test_contact_with_a_tip_and_a_shaft_and_no_wall_in_reach():
     wall = np.array([[-1.0, 0.0, 1.0, 0.0]])
     height = np.linspace(0.0999, 0.02, 400)  # of the base above the wall, seen at 45 degrees
     poses = np.column_stack([np.zeros(400), height, np.full(400, -np.pi / 4)])
@@ -139,7 +132,6 @@ def test_contact_with_a_tip_and_a_shaft_and_no_wall_in_reach() -> None:
     assert lies.argmax() > touching.argmax() > 0
     assert (np.diff(reach[lies]) < 0).all()
     assert np.abs(np.diff(reach)).max() < 3e-3  # without jumps
-    # A whisker along the wall has the wall's direction.
     assert np.allclose(turn[lies] * shaft_tilt(FAN, reach[lies]), np.pi / 4)
     for wall in (np.array([[0.0, 0.5, 1.0, 0.5]]), np.zeros((0, 4))):
         bend = bend_whiskers(FAN, np.zeros((3, 3)), wall, FREE)
@@ -148,7 +140,7 @@ def test_contact_with_a_tip_and_a_shaft_and_no_wall_in_reach() -> None:
 
 
 @given(st.floats(0.02, 0.139), st.floats(0.2, 1.0))
-def test_moments_are_those_of_a_tapered_beam(reach: float, taper: float) -> None:
+def test_moments_are_those_of_a_tapered_beam(reach, taper):
     """Compared with the integrated curvature of a cone under a point force."""
     shaft = FAN._replace(radius=0.7e-3, taper=(1 - taper) / LENGTH)
     x = np.linspace(0, reach, 4001)
@@ -165,21 +157,18 @@ def test_moments_are_those_of_a_tapered_beam(reach: float, taper: float) -> None
     assert strain[0, 0, 0] == pytest.approx(0.7e-3 * curvature[0], rel=1e-4)
 
 
-def test_impossible_whiskers_are_refused() -> None:
+def test_impossible_whiskers_are_refused():
     wrong = {"dead": (4,), "tip_diameter": 2e-3, "mounts": (), "length": 0.0, "droop_deg": 45.0}
     for name, value in wrong.items():
         with pytest.raises(ValidationError):
             WhiskersConfig.model_validate({name: value})
 
 
-# Strain templates: training by the command, other walls, use in sessions
-
 DRIVES = CreateSimulationConfig(seed=4)
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Templates made from a configuration by the program."""
+def file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("templates")
     (folder / "create.yaml").write_text("create_simulation: {seed: 4}\n")
     path = folder / "new" / "t.npz"
@@ -188,7 +177,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def templates(file: Path) -> StrainTemplates:
+def templates(file):
     return StrainTemplates.read(file)
 
 
@@ -197,7 +186,7 @@ def errors(drives: list[HeldOutDrive], way: str, known: bool) -> np.ndarray:
     return np.array([error[:, ESTIMATORS.index(way)] for _, there, error in drives if there == known])
 
 
-def test_walls_without_training_are_recognised(templates: StrainTemplates) -> None:
+def test_walls_without_training_are_recognised(templates):
     assert np.abs(templates.mean).sum() == pytest.approx(117.444679)
     tried = drive_held_out(DRIVES, templates)
     assert [known for _, known, _ in tried] == [True, False] * 14 + [True]
@@ -212,7 +201,7 @@ def test_walls_without_training_are_recognised(templates: StrainTemplates) -> No
         drive_held_out(DRIVES, templates._replace(mean=templates.mean[::-1].copy()))
 
 
-def test_sessions_use_the_file(file: Path) -> None:
+def test_sessions_use_the_file(file):
     given, seen = {"walls": "template", "templates": file, "max_template_error": None}, []
     for reports in (given, given | {"templates": None}):
         simulation = CreateSimulation(CreateSimulationConfig(reports=40, seed=1))
@@ -223,7 +212,7 @@ def test_sessions_use_the_file(file: Path) -> None:
     assert np.allclose(seen[0], seen[1], atol=10.01)
 
 
-def test_invalid_sessions_are_refused(tmp_path: Path, capsys) -> None:
+def test_invalid_sessions_are_refused(tmp_path, capsys):
     config = tmp_path / "c.yaml"
     for text, message in (
         ("simulation: {}\n", "create_simulation"),

@@ -1,7 +1,6 @@
 """The raw tiers: mechanics compared with theory, agreement; noise and drift; errors of simulated odometry."""
 
 import itertools
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +37,8 @@ LOW = Surroundings(Walls(np.array([[-1.0, -1.0, 1.0, 1.0]]), np.array([0.05])), 
 TOUCH = LOW.contact(np.zeros((1, 3))).angle[0]
 STILL = HeadPath(np.array([0.0, 100.0]), np.zeros((2, 3)))
 LIMIT = np.full(18, 0.04)
-SAMPLES, CYCLES = 80, 3
+SAMPLES, CYCLES, NOISE = 80, 3, 2e-3
+KINDS = ("white", "gated", "telescoping")
 
 
 def maze(count: int) -> tuple[Surroundings, HeadPath, np.ndarray]:
@@ -54,14 +54,11 @@ def calibration(tier: MechanicsModel, setup: HeadSetup) -> Calibration:
 
 
 def one(tier: MechanicsModel, whisking: WhiskingConfig, path: HeadPath = STILL, **mechanics: float) -> Cycle:
-    """A cycle above the plate."""
     setup = HeadSetup(HEAD, STREAM, MechanicsConfig(noise=0.0, **mechanics), whisking)
     return next(simulate_cycles(tier, setup, LOW, path, np.zeros(1), stream(0, "sensor"), LIMIT))
 
 
-def detected_contacts(
-    tier: MechanicsModel, count: int, whisking: WhiskingConfig, rate: float = 2000.0
-) -> Whisk:
+def detected_contacts(tier: MechanicsModel, count: int, whisking: WhiskingConfig, rate=2000.0) -> Whisk:
     setup = HeadSetup(HEAD, StreamConfig(rate=rate), MECHANICS, whisking)
     known = calibration(tier, setup)
     raw = simulate_cycles(tier, setup, *maze(count), stream(1, "sensor"), known.threshold[:, 1])
@@ -69,7 +66,7 @@ def detected_contacts(
     return Whisk(*(np.array(column) for column in zip(*whisks, strict=True)))
 
 
-def test_a_beam_has_the_stiffness_of_theory_and_the_modes_of_a_cantilever() -> None:
+def test_a_beam_has_the_stiffness_of_theory_and_the_modes_of_a_cantilever():
     for taper, reach in itertools.product((0.1, 0.2, 0.6), (1.0, 0.65)):
         model = make_beam(ShaftConfig(taper=taper))
         shape = model.at(np.array(reach))
@@ -84,24 +81,21 @@ def test_a_beam_has_the_stiffness_of_theory_and_the_modes_of_a_cantilever() -> N
 
 
 @TIERS
-def test_free_whiskers_follow_the_command_and_calibration_refuses_a_record_with_contacts(
-    tier: MechanicsModel,
-) -> None:
+def test_free_whiskers_follow_the_command_and_calibration_refuses_contacts(tier):
     found = calibration(tier, HeadSetup(ur10_head(HeadConfig(dead=(3, 7))), STREAM, MECHANICS, OPEN))
     assert np.flatnonzero(~found.alive).tolist() == [3, 7]
     np.testing.assert_allclose(found.free[found.alive], np.radians(65), atol=0.02)
     # Tolerance: the sensor's noise and the inertia of the long whiskers.
     assert ((found.sd > 0.97 * 2e-3) & (found.sd < 1.25 * 2e-3))[found.alive].all()
     np.testing.assert_allclose(found.mean, 0.0, atol=3e-4)
-    raw = simulate_cycles(
-        tier, HeadSetup(HEAD, STREAM, MECHANICS, OPEN), *maze(4), stream(1, "s"), np.full(18, np.inf)
-    )
+    setup = HeadSetup(HEAD, STREAM, MECHANICS, OPEN)
+    raw = simulate_cycles(tier, setup, *maze(4), stream(1, "s"), np.full(18, np.inf))
     with pytest.raises(InputError, match="contacts of whisker"):
         calibrate(CalibrationConfig(), list(raw))
 
 
 @TIERS
-def test_drive_and_whisker_share_the_command_beyond_contact_until_it_slips_off(tier: MechanicsModel) -> None:
+def test_drive_and_whisker_share_the_command_beyond_contact_until_it_slips_off(tier):
     for servo in (0.2, 1.0):
         cycle = one(tier, WhiskingConfig(mode="open", rate=0.25), servo=servo, slip=1.0)
         hard = stiffness(ShaftConfig(), 1.0)
@@ -117,11 +111,9 @@ def test_drive_and_whisker_share_the_command_beyond_contact_until_it_slips_off(t
 
 
 @TIERS
-def test_readings_do_not_depend_on_the_batch_size_and_stay_the_same(tier: MechanicsModel) -> None:
-    runs = [
-        list(simulate_cycles(tier, setup, *maze(5), stream(1, "s"), LIMIT))
-        for setup in (HeadSetup(HEAD, StreamConfig(batch=n), MECHANICS, RCP) for n in (2, 5))
-    ]
+def test_readings_do_not_depend_on_the_batch_size_and_stay_the_same(tier):
+    setups = [HeadSetup(HEAD, StreamConfig(batch=n), MECHANICS, RCP) for n in (2, 5)]
+    runs = [list(simulate_cycles(tier, setup, *maze(5), stream(1, "s"), LIMIT)) for setup in setups]
     for a, b in zip(*runs, strict=True):
         for part in ("time", "angle", "deflection"):
             np.testing.assert_allclose(getattr(a, part), getattr(b, part), rtol=0, atol=1e-9)
@@ -137,7 +129,7 @@ SOAK_MODES = [pytest.param(mode, marks=pytest.mark.soak) for mode in ("rcp", "sp
 
 
 @pytest.mark.parametrize("mode", ["open", *SOAK_MODES])
-def test_both_raw_tiers_agree_on_contacts(mode: str) -> None:
+def test_both_raw_tiers_agree_on_contacts(mode):
     whisking = WhiskingConfig(mode=mode)
     slow, quick = (detected_contacts(tier, 30, whisking) for tier in (simulate_dynamic, QUASISTATIC))
     assert slow.contact.mean() > 0.1
@@ -147,7 +139,7 @@ def test_both_raw_tiers_agree_on_contacts(mode: str) -> None:
 
 
 @TIERS
-def test_contacts_do_not_depend_on_the_sample_rate(tier: MechanicsModel) -> None:
+def test_contacts_do_not_depend_on_the_sample_rate(tier):
     usual, other = (detected_contacts(tier, 10, RCP, rate) for rate in (2000.0, 1000.0))
     assert (usual.contact != other.contact).sum() <= 1
     off = (usual.touched - other.touched)[usual.contact & other.contact]
@@ -169,7 +161,7 @@ CUTS = st.lists(st.integers(1, SAMPLES - 1), max_size=6, unique=True)
 
 
 @given(CUTS, st.sampled_from(["open", "rcp", "spread"]))
-def test_a_quasistatic_cycle_in_any_parts_equals_the_whole_to_the_bit(cuts: list[int], mode: str) -> None:
+def test_a_quasistatic_cycle_in_any_parts_equals_the_whole_to_the_bit(cuts, mode):
     config, mechanics, whole = StreamConfig(rate=SAMPLES), MechanicsConfig(slip=0.1), sweep()
     whisking = WhiskingConfig(mode=mode)
 
@@ -190,11 +182,6 @@ def test_a_quasistatic_cycle_in_any_parts_equals_the_whole_to_the_bit(cuts: list
         assert np.array_equal(np.concatenate([found[k] for found in parts]), column)
 
 
-# Errors of odometry, and coloured noise, drift and creep of whiskers
-
-KINDS = ("white", "gated", "telescoping")
-
-
 def drive_and_turn(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Repeats 20 s ahead at 30 mm/s and 5 s of turning on the spot at 0.4 rad/s."""
     turns = np.arange(count) % 25 >= 20
@@ -205,7 +192,7 @@ def drive_and_turn(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(count, dtype=float), pose
 
 
-def measured(scene: tuple[np.ndarray, np.ndarray], seed: int = 0, hidden=None, **config: Any) -> np.ndarray:
+def measured(scene: tuple[np.ndarray, np.ndarray], seed=0, hidden=None, **config) -> np.ndarray:
     return reckoning.simulate_odometry(OdometryConfig(**config), *scene, stream(seed, "odometry"), hidden)
 
 
@@ -215,7 +202,7 @@ def errors(kind: str, scene: tuple[np.ndarray, np.ndarray], seed: int = 0, **bia
     return np.column_stack([error[:, :2], wrap(error[:, 2])])
 
 
-def test_errors_of_each_kind_follow_from_their_seed() -> None:
+def test_errors_of_each_kind_follow_from_their_seed():
     assert np.abs(errors("none", drive_and_turn(100))).max() < 1e-12
     known = {
         "white": [[-0.073578, 0.108129], [-0.083586, -0.004056], [-0.011004, -0.447488]],
@@ -228,8 +215,7 @@ def test_errors_of_each_kind_follow_from_their_seed() -> None:
         np.testing.assert_allclose(np.cumsum(error[:, [0, 2]], axis=0)[[18, 22, 58]], sums, atol=1e-6)
 
 
-def test_noise_does_not_depend_on_the_row_rate_and_a_kidnap_repeats_the_motion_before() -> None:
-    """Errors at twice the row rate add up to the same errors."""
+def test_noise_does_not_depend_on_the_row_rate_and_a_kidnap_repeats_the_motion_before():
     time, pose = drive_and_turn(200)
     fine = np.arange(0, 199.5, 0.5)
     finely = np.column_stack([np.interp(fine, time, column) for column in pose.T])
@@ -249,9 +235,7 @@ RATES = st.sampled_from([0.3, 1.0, 3.7])
 
 
 @given(st.integers(0, 10**6), st.sampled_from([*KINDS, "none"]), RATES, st.floats(0.2, 2.5))
-def test_errors_of_a_growing_path_are_those_of_the_path_so_far(
-    seed: int, kind: str, rate: float, period: float
-) -> None:
+def test_errors_of_a_growing_path_are_those_of_the_path_so_far(seed, kind, rate, period):
     """To the bit, whatever follows: a live session gives its motions one by one. Row 0 sets the clock."""
     given = {"noise": kind, "rate": rate, "length_bias": 0.02, "heading_bias": 0.1}
     _, pose = drive_and_turn(30)
@@ -266,13 +250,8 @@ def test_errors_of_a_growing_path_are_those_of_the_path_so_far(
             assert (*step, time[row] - time[row - 1]) == tuple(whole[-1]), row
 
 
-NOISE = 2e-3
-
-
 @given(st.floats(0.001, 0.5), st.floats(0.05, 3), st.sampled_from([200.0, 2000.0]), st.floats(-1, 1))
-def test_creep_tends_to_its_share_of_a_deflection_and_returns_to_zero(
-    share: float, time: float, rate: float, bend: float
-) -> None:
+def test_creep_tends_to_its_share_of_a_deflection_and_returns_to_zero(share, time, rate, bend):
     whisker = Baseline(BaselineConfig(creep=share, creep_time=time), NOISE, rate, 1, 0)
     count = round(rate * time)
     bent = whisker.wander(np.full((1, count, 1, 2), bend))[0, :, 0, 0]
@@ -284,7 +263,7 @@ def test_creep_tends_to_its_share_of_a_deflection_and_returns_to_zero(
 
 
 @given(st.lists(st.integers(1, 119), max_size=6, unique=True))
-def test_the_parts_into_which_the_samples_are_cut_make_no_difference(cuts: list[int]) -> None:
+def test_the_parts_into_which_the_samples_are_cut_make_no_difference(cuts):
     deflection = stream(1, "bends").standard_normal((1, 120, 2, 2))
 
     def samples(ends: list[int]) -> np.ndarray:
@@ -297,7 +276,7 @@ def test_the_parts_into_which_the_samples_are_cut_make_no_difference(cuts: list[
     assert make_baseline(BaselineConfig(), NOISE, 2000.0, 18, 0) is None
 
 
-def simulate(baseline: BaselineConfig, **changes: Any) -> HeadSimulation:
+def simulate(baseline: BaselineConfig, **changes: object) -> HeadSimulation:
     slow = {"path": {"explore": 4.0}, "stream": {"rate": 1000.0}, "whisking": {"mode": "open"}}
     mechanics = {"mechanics": {"baseline": baseline.model_dump()}}
     return HeadSimulation(SimulationConfig.model_validate(slow | mechanics | changes))
@@ -308,7 +287,7 @@ def bends(source: HeadSimulation) -> np.ndarray:
 
 
 @pytest.mark.parametrize("fidelity", ["quasistatic", "dynamic"])
-def test_a_baseline_reaches_the_deflections_of_a_session_and_nothing_else(fidelity: str) -> None:
+def test_a_baseline_reaches_the_deflections_of_a_session_and_nothing_else(fidelity):
     source, plain = (simulate(one, fidelity=fidelity) for one in (HALL_BASELINE, BaselineConfig()))
     for with_it, without in zip(source, plain, strict=True):
         assert np.array_equal(with_it.reading.angle, without.reading.angle)
@@ -320,7 +299,7 @@ def test_a_baseline_reaches_the_deflections_of_a_session_and_nothing_else(fideli
     assert np.array_equal(bends(cut), bends(source))
 
 
-def test_drift_goes_on_through_the_free_record_and_from_whisk_to_whisk() -> None:
+def test_drift_goes_on_through_the_free_record_and_from_whisk_to_whisk():
     source = simulate(BaselineConfig(drift=100.0), calibration={"max_outlier_share": 0.9})
     drift = bends(source) - bends(simulate(BaselineConfig(), raw=True))
     assert (drift[1:, 0] - drift[:-1, -1]).std() < 0.1 * (drift[:, -1] - drift[:, 0]).std()
@@ -328,7 +307,7 @@ def test_drift_goes_on_through_the_free_record_and_from_whisk_to_whisk() -> None
     assert drift[0, 0].std() == pytest.approx(2 * 100 * NOISE, rel=0.5)
 
 
-def test_a_seed_gives_the_same_noise_and_drift_for_ever() -> None:
+def test_a_seed_gives_the_same_noise_and_drift_for_ever():
     made = make_baseline(HALL_BASELINE, NOISE, 100.0, 200, 5)
     assert made is not None
     colour = made.colour(NOISE * stream(5, "sensor").standard_normal((1, 400, 200, 2))) / NOISE

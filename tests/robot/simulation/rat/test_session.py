@@ -1,7 +1,6 @@
 """Sessions of a rat: panoramic views, odometry, phases, errors; paths, their files and random walks."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,13 +33,12 @@ def look(box: BoxConfig, pose: list, turns: tuple = (0.0, 0.0), stretch: tuple =
 
 
 @given(st.floats(0.01, 0.99), st.floats(0.01, 0.99), st.integers(0, 35))
-def test_a_turn_by_columns_rolls_the_view(x: float, y: float, columns: int) -> None:
-    """Counter-clockwise: what was seen `columns` to the left is now ahead."""
+def test_a_turn_by_columns_rolls_the_view(x, y, columns):
     turned = look(BoxConfig(), [x, y, 0.003 + columns * 2 * np.pi / 36])
     np.testing.assert_allclose(turned, np.roll(look(BoxConfig(), [x, y, 0.003]), -columns), atol=1e-9)
 
 
-def test_cues_are_at_their_directions_and_views_of_a_turned_and_stretched_box_stay_the_same() -> None:
+def test_cues_are_at_their_directions_and_views_of_a_turned_and_stretched_box_stay_the_same():
     card = CueConfig(at_deg=90, extent_deg=40, brightness=1.0)
     box = BoxConfig(wall=10.0, cards=(card,), distal=(), wall_brightness=0.2)
     view = look(box, [0.5, 0.5, 0.0])
@@ -57,7 +55,7 @@ def test_cues_are_at_their_directions_and_views_of_a_turned_and_stretched_box_st
     assert torus_ratio((0.0, 0.0, 3.5, 2.1), 1.05) == pytest.approx((10 / 3, 2.0))
 
 
-def test_exact_odometry_integrates_to_the_truth() -> None:
+def test_exact_odometry_integrates_to_the_truth():
     for source in (session(), session(None, seconds=60.0), session(None, seconds=60.0, walk={})):
         found = integrate(source.odometry[:, :3], source.truth[0])
         np.testing.assert_allclose(found[:, :2], source.truth[:, :2], atol=1e-9)
@@ -66,7 +64,7 @@ def test_exact_odometry_integrates_to_the_truth() -> None:
         assert (source.odometry[1:, 3] == 0.05).all()
 
 
-def test_the_same_settings_give_the_same_bits() -> None:
+def test_the_same_settings_give_the_same_bits():
     def contents(**given) -> tuple:
         source = RatSimulation(RatSimulationConfig(seconds=10.0, **given))
         parts = [(s.time, s.truth.tobytes(), s.reading.view.tobytes(), *s.reading.odometry) for s in source]
@@ -77,7 +75,7 @@ def test_the_same_settings_give_the_same_bits() -> None:
     assert len({contents(**given)[0] for given in ({}, {"seed": 1}, {"path": {"skip": 1.0}})}) == 3
 
 
-def test_readings_have_views_at_every_nth_row_and_a_dark_phase_leaves_the_noise_of_others() -> None:
+def test_readings_have_views_at_every_nth_row_and_a_dark_phase_leaves_the_noise_of_others():
     samples = list(session(views={"every": 4, "columns": 12}))
     seen = [bool(sample.reading.view_seen) for sample in samples[:9]]
     assert seen == 2 * [True, False, False, False] + [True]
@@ -92,7 +90,7 @@ def test_readings_have_views_at_every_nth_row_and_a_dark_phase_leaves_the_noise_
     assert 21 * light.info.cell_size == pytest.approx(1.05)  # a torus larger than the box
 
 
-def test_a_kidnap_or_a_stretched_box_changes_the_truth_and_the_odometry_goes_on() -> None:
+def test_a_kidnap_or_a_stretched_box_changes_the_truth_and_the_odometry_goes_on():
     source = session(phases=[{"start": 20, "kidnap": [0.2, 0.5]}], seconds=30.0)
     assert np.hypot(*(source.truth[400, :2] - [0.2, 0.5])) < 0.02
     assert np.flatnonzero(np.hypot(*np.diff(source.truth[:, :2], axis=0).T) > 0.3).tolist() == [399]
@@ -108,7 +106,7 @@ def test_a_kidnap_or_a_stretched_box_changes_the_truth_and_the_odometry_goes_on(
     assert np.hypot(*source.odometry[:, :2].T).max() < 0.02
 
 
-def test_a_conflict_of_cues_is_two_phases_and_another_box_has_its_own_cues_and_size() -> None:
+def test_a_conflict_of_cues_is_two_phases_and_another_box_has_its_own_cues_and_size():
     local = {"start": 10, "rotate_cues_deg": 45, "cues": "local"}
     distal = {"start": 20, "rotate_cues_deg": -45, "cues": "distal"}
     times = session(phases=[local, distal, {"start": 30, "rotate_cues_deg": 10}]).timeline
@@ -124,7 +122,7 @@ def test_a_conflict_of_cues_is_two_phases_and_another_box_has_its_own_cues_and_s
     assert source.info.cell_size == pytest.approx(0.1)
 
 
-def test_phases_boxes_and_paths_that_do_not_fit() -> None:
+def test_phases_boxes_and_paths_that_do_not_fit():
     broken = PATH.position.copy()
     broken[3, 0] = np.nan
     for phases, message in (
@@ -154,7 +152,7 @@ def test_phases_boxes_and_paths_that_do_not_fit() -> None:
             RatSimulationConfig(**settings)
 
 
-def test_errors_of_odometry_are_independent_and_stay_the_same() -> None:
+def test_errors_of_odometry_are_independent_and_stay_the_same():
     def odometry(**errors: float) -> np.ndarray:
         return session(None, walk={}, seconds=50.0, odometry=EXACT | errors).odometry
 
@@ -169,17 +167,13 @@ def test_errors_of_odometry_are_independent_and_stay_the_same() -> None:
     np.testing.assert_allclose(odometry(heading_bias=0.02)[1:, 2], truth[1:, 2] + 0.001)
 
 
-# Paths
-
 MOTION = MotionConfig()
 MILLIMETRES = st.integers(0, 1000).map(lambda value: value / 1000)
-
-
 POINTS = st.lists(st.tuples(MILLIMETRES, MILLIMETRES), min_size=2, max_size=20)
 
 
 @given(POINTS, st.floats(5, 60), st.sampled_from([0.0, 0.1]))
-def test_sampled_positions_stay_in_bounds(points: list, rate: float, smoothing: float) -> None:
+def test_sampled_positions_stay_in_bounds(points, rate, smoothing):
     position = np.array(points)
     path = RatPath(0.5 * np.arange(len(points)), position)
     pose = sample_path(path, MOTION, rate, smoothing)
@@ -190,16 +184,13 @@ def test_sampled_positions_stay_in_bounds(points: list, rate: float, smoothing: 
     np.testing.assert_allclose(kept[:, :2], path.position, atol=1e-9)
 
 
-def test_the_heading_is_that_of_a_circle_and_is_not_wrapped() -> None:
+def test_the_heading_is_that_of_a_circle_and_not_wrapped_and_a_standing_rat_keeps_it():
     angle = np.linspace(0, 6 * np.pi, 601)
     heading = sample_path(RatPath(angle, np.column_stack([np.cos(angle), np.sin(angle)])), MOTION, 50.0)[:, 2]
     np.testing.assert_allclose(heading[50:-50], (np.arange(len(heading)) / 50)[50:-50] + np.pi / 2, atol=0.01)
     given = RatPath(np.array([0.0, 1.0]), np.zeros((2, 2)), np.array([3.0, -3.0]))
     np.testing.assert_allclose(sample_path(given, MOTION, 2.0)[:, 2], [3.0, np.pi, 2 * np.pi - 3.0])
-
-
-def test_a_standing_rat_keeps_its_heading() -> None:
-    """North, 4 s of standing with a jitter of 0.1 mm, then west."""
+    # North, 4 s of standing with a jitter of 0.1 mm, then west.
     way = np.linspace(0, 0.4, 41)
     place = np.column_stack([np.pad(-way, (81, 0)), np.pad(way, (0, 81), "edge")])
     position = place + 1e-4 * np.random.default_rng(1).standard_normal((122, 2))
@@ -209,7 +200,7 @@ def test_a_standing_rat_keeps_its_heading() -> None:
     assert np.abs(np.diff(pose[:, 2])).max() < 0.2
 
 
-def test_packaged_paths_are_of_rats() -> None:
+def test_packaged_paths_are_of_rats():
     for name, seconds, size in (("sargolini", 599.5, (1.0, 1.0)), ("tanni", 1199.5, (3.5, 2.5))):
         path = simulated.read_path(PathFileConfig(file=name))
         assert path.time[-1] - path.time[0] > seconds
@@ -218,7 +209,7 @@ def test_packaged_paths_are_of_rats() -> None:
 
 
 @pytest.mark.parametrize("kind", ["csv", "npz", "whole numbers"])
-def test_files_of_each_kind_give_the_same_path(kind: str, tmp_path: Path) -> None:
+def test_files_of_each_kind_give_the_same_path(kind, tmp_path):
     time, position = 0.1 * np.arange(30), np.random.default_rng(0).integers(0, 10_000, (30, 2)) / 1000
     file = tmp_path / ("a.csv" if kind == "csv" else "a.npz")
     if kind == "csv":
@@ -233,7 +224,7 @@ def test_files_of_each_kind_give_the_same_path(kind: str, tmp_path: Path) -> Non
     np.testing.assert_allclose(path.position, position[11:] * 0.01 + [1.0, 0.0], atol=1e-12)
 
 
-def test_a_faulty_path_gives_file_and_row(tmp_path: Path) -> None:
+def test_a_faulty_path_gives_file_and_row(tmp_path):
     np.savez(tmp_path / "a.npz", t=np.arange(3.0), pos=np.zeros((3, 3)))
     np.savez(tmp_path / "b.npz", t=np.array([0.0, 0.1]), pos=np.array([[0.0, 0.0], [np.nan, 0.0]]))
     for config, message in (
@@ -245,9 +236,7 @@ def test_a_faulty_path_gives_file_and_row(tmp_path: Path) -> None:
             simulated.read_path(PathFileConfig(**config))
     for lines, message in (
         (["0,0,0", "0.1,nan,0", "0.2,0,0"], ":3: x is nan"),
-        (["0,0,0", "0.1,,0"], ":3: x is empty"),
         (["0,0,0", "0.1,0,0", "0.05,0,0"], ":4: t goes back"),
-        (["0,0,0", "0.1,0,0", "0.1,0,0"], ":4: t repeats"),
         (["0,0,0", "0.1,60,0"], ":3: a speed of 600 m/s; expected at most 5 m/s"),
         (["0,0,0", "0.1,0,0", "9,0,0"], ":4: no position for 8.9 s; expected at most 2 s"),
         (["0,0,0"], ":2: 1 positions"),
@@ -258,7 +247,7 @@ def test_a_faulty_path_gives_file_and_row(tmp_path: Path) -> None:
             simulated.read_path(PathFileConfig(file=file))
 
 
-def test_a_walk_has_the_given_speeds_stays_inside_and_begins_a_longer_one() -> None:
+def test_a_walk_has_the_given_speeds_stays_inside_and_begins_a_longer_one():
     config = simulated.RandomWalkConfig(speed=0.2, speed_sd=0.1)
     path = simulated.walk_randomly(config, (1.0, 0.6), 300.0, 20.0, 3)
     assert ((path.position >= 0) & (path.position <= [1.0, 0.6])).all()
