@@ -19,21 +19,6 @@ SYNTHETIC = (
 )
 
 
-@pytest.fixture(scope="session")
-def find_trace(golden: Path, request: pytest.FixtureRequest) -> Callable[[str], Path]:
-    """Finds the path of a reference trace, in the project's golden files or among the recordings."""
-
-    def find(name: str) -> Path:
-        path = golden / f"{name}.npz"
-        if not path.is_file():
-            path = request.getfixturevalue("reference_data") / "traces" / f"{name}.npz"
-        if not path.is_file():
-            pytest.skip(f"no {path}")
-        return path
-
-    return find
-
-
 @pytest.fixture(params=SYNTHETIC)
 def trace(request: pytest.FixtureRequest, find_trace: Callable[[str], Path]) -> Path:
     """Each synthetic reference trace."""

@@ -28,7 +28,7 @@ from robot.recordings.mcap_writer import record_source
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.touch_source import open_touch_source
-from tests.helpers.commands import ROOT, SQUARE, said
+from tests.helpers.commands import ROOT, SQUARE, said, start
 
 FILES = {
     "online_error.csv", "calibration.yaml", "closures.csv", "config.yaml", "manifest.json", "map.g2o",
@@ -60,11 +60,8 @@ def test_without_closures_the_map_is_odometry(backend, tmp_path, capsys):
     found = json.loads((tmp_path / "run" / "scorecard.json").read_text())["health"]
     assert (found["worse_than_odometry"], found["reason"]) == (None, NO_CLOSURE)
     assert not (tmp_path / "run" / "calibration.yaml").exists()
-    *_, done, error, closures, warnings, health = text.splitlines()
-    assert re.fullmatch(rf"{tmp_path}/run: 349 steps of a_square3 by {backend}, \S+ s, \S+ m .*", done)
-    assert re.fullmatch(r"ATE, final \(RMS\): (\S+) m, odometry \1 m", error)
-    assert re.fullmatch("closures: (none|0 of .*)", closures)
-    assert (warnings, health) == ("warnings: none", f"health: input clean; {NO_CLOSURE}")
+    assert re.search(r"ATE, final \(RMS\): (\S+) m, odometry \1 m", text)
+    assert text.endswith(f"warnings: none\nhealth: input clean; {NO_CLOSURE}\n")
 
 
 @pytest.mark.soak
@@ -176,8 +173,7 @@ def test_a_recording_of_raw_samples_gives_the_observations_of_the_simulation(tmp
 def test_an_interrupted_session_is_complete_and_a_killed_one_readable(number, tmp_path):
     config, path = tmp_path / "long.yaml", tmp_path / "long.mcap"
     config.write_text("simulation: {path: {explore: 30000}, mechanics: {poses: 2}}\n")
-    command = [sys.executable, "-m", "ratslam", "simulate", str(config), "-o", str(path)]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = start("simulate", config, "-o", path)
     while process.poll() is None and not (path.exists() and path.stat().st_size > 30_000):
         time.sleep(0.005)
     process.send_signal(number)
