@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -92,9 +93,8 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ["XLA_FLAGS"] = add_xla_flags(flags)
 
 
-@pytest.hookimpl(trylast=True)  # after benchmarks/conftest.py has marked its tests
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    soak = config.getoption("--soak")
+    soak = config.getoption("--soak") or config.getoption("--benchmark-only")
     chosen = [item for item in items if bool(item.get_closest_marker("soak")) == soak]
     if config.getoption("--part"):
         modules = modules_of_part(config.getoption("--part"), {_module(item) for item in chosen})
@@ -147,6 +147,21 @@ def reference_data() -> Path:
 def golden() -> Path:
     """The folder of the reference engine's traces that are part of the project."""
     return ROOT / "tests" / "golden"
+
+
+@pytest.fixture(scope="session")
+def find_trace(golden: Path, request: pytest.FixtureRequest) -> Callable[[str], Path]:
+    """Finds the path of a reference trace, in the project's golden files or among the recordings."""
+
+    def find(name: str) -> Path:
+        path = golden / f"{name}.npz"
+        if not path.is_file():
+            path = request.getfixturevalue("reference_data") / "traces" / f"{name}.npz"
+        if not path.is_file():
+            pytest.skip(f"no {path}")
+        return path
+
+    return find
 
 
 @pytest.fixture(scope="session")

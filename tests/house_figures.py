@@ -205,7 +205,6 @@ FIGURES = {
 
 
 def count(root: Path) -> dict[str, int]:
-    """The number of every figure for the checkout in `root`."""
     house = read_house(root)
     return {name: figure.number(figure.items(house).values()) for name, figure in FIGURES.items()}
 

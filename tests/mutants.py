@@ -27,8 +27,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tests.house_figures import PACKAGES
+
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("ratslam", "robot", "evaluation", "tactile")
 DRAWN = ROOT / "tests" / "data" / "mutants.json"
 KINDS = ("comparison", "operator", "constant", "statement")
 COMPARISONS = {
@@ -54,10 +55,6 @@ class Mutant(NamedTuple):
     column: int
     before: str
     after: str
-
-
-def product_files(root: Path) -> list[Path]:
-    return [path for package in PACKAGES for path in sorted((root / package).rglob("*.py"))]
 
 
 def room_of(file: str) -> str:
@@ -127,7 +124,8 @@ def _code(node: ast.AST) -> Iterator[ast.AST]:
 
 def draw(root: Path, count: int, seed: int) -> list[Mutant]:
     """`count` mutants: rooms by the root of their lines, kinds in turn, files and places at random."""
-    texts = {str(path.relative_to(root)): path.read_text(encoding="utf-8") for path in product_files(root)}
+    paths = [path for package in PACKAGES for path in sorted((root / package).rglob("*.py"))]
+    texts = {str(path.relative_to(root)): path.read_text(encoding="utf-8") for path in paths}
     by_room: dict[str, list[Mutant]] = {}
     lines: dict[str, int] = {}
     for file, text in texts.items():

@@ -30,7 +30,6 @@ def read(path):
 
 
 def blocks(path, *languages):
-    """The fenced code blocks of a README in one of the languages."""
     found = re.findall(r"^```(\w*)\n(.*?)^```", read(path), re.MULTILINE | re.DOTALL)
     return [body for language, body in found if language in languages]
 

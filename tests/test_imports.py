@@ -40,7 +40,6 @@ def wheel(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def site(wheel, tmp_path_factory):
-    """A folder of packages with the wheel in it."""
     folder = tmp_path_factory.mktemp("site")
     with ZipFile(wheel) as archive:  # a wheel of Python files is installed by unpacking it
         archive.extractall(folder)
@@ -48,7 +47,6 @@ def site(wheel, tmp_path_factory):
 
 
 def printed(command, folder, environment):
-    """What a command prints, which ends well."""
     ended = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     return ended.stdout

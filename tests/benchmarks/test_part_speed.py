@@ -31,6 +31,8 @@ from tactile.base.se2 import integrate
 from tactile.base.types import stack
 from tactile.frontend import TouchConfig
 
+pytestmark = pytest.mark.soak
+
 
 def timed(benchmark, call, count=1, rounds=5):
     """What a call returns; its median time is noted, and that of each of its `count` parts."""

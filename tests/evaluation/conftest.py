@@ -1,7 +1,6 @@
-"""Reference traces, and small runs whose right answers are known."""
+"""Small runs whose right answers are known."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,25 +10,9 @@ from tactile.base.se2 import compose, integrate, inverse
 
 
 @pytest.fixture(scope="session")
-def trace(golden: Path, request: pytest.FixtureRequest) -> Callable[[str], dict[str, np.ndarray]]:
-    """A recorded run of the reference implementation; the synthetic ones are part of the project."""
-
-    def load(name: str) -> dict[str, np.ndarray]:
-        path = golden / f"{name}.npz"
-        if not path.is_file():
-            path = request.getfixturevalue("reference_data") / "traces" / f"{name}.npz"
-        with np.load(path) as file:
-            return dict(file)
-
-    return load
-
-
-@pytest.fixture(scope="session")
 def square() -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:
-    """Laps round a 0.6 m square of 8 places 0.3 m apart: ids [N] and true poses [N, 3].
-
-    At each place the robot dwells some steps, 0.02 m a step along its side.
-    """
+    """Laps round a 0.6 m square of 8 places 0.3 m apart: ids [N] and true poses [N, 3]; at each place the
+    robot dwells some steps, 0.02 m a step along its side."""
 
     def walk(laps: int, dwell: int) -> tuple[np.ndarray, np.ndarray]:
         corners = np.array([[0, 0, 0], [0.6, 0, np.pi / 2], [0.6, 0.6, np.pi], [0, 0.6, -np.pi / 2]])

@@ -74,7 +74,6 @@ class CommandWorker:
         return int(pages) * os.sysconf("SC_PAGESIZE")
 
     def close(self) -> None:
-        """Ends the process."""
         self._process.kill()
         self._process.communicate()
 

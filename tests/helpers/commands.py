@@ -1,5 +1,10 @@
-"""Commands of the program, run in this process: what they print, and how they refuse."""
+"""Commands of the program, run in this process: what they print, how they refuse, and the run of `square`."""
 
+import fcntl
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,3 +41,30 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     errors = [line.split("error: ", 1)[1] for line in lines if "error: " in line]
     assert errors
     return "\n".join(errors)
+
+
+def copy_square_run(directory: Path) -> Path:
+    """A copy of the finished run of `configs/square.yaml`, which the workers of a test session make once."""
+    folder = Path(os.environ["RATSLAM_TEST_FOLDER"])
+    made = folder / "square"
+    with (folder / "square.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            partial = folder / "square.partial"
+            shutil.rmtree(partial, ignore_errors=True)
+            # The name of the directory is the title of its pictures.
+            assert main(["run", SQUARE, "-o", str(partial / "run")]) == 0
+            partial.rename(made)
+    return Path(shutil.copytree(made / "run", directory))
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    """The program in a process group of its own; it heeds the interrupts that background programs ignore."""
+    code = (
+        "import signal, sys; from ratslam.__main__ import main; "
+        "signal.signal(signal.SIGINT, signal.default_int_handler); sys.exit(main(sys.argv[1:]))"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)], cwd=ROOT, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip

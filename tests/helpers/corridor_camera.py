@@ -1,14 +1,12 @@
 """A rendered camera: a textured corridor around a block, driven round twice, with known truth.
 
 Walls, floor and ceiling carry random textures of several scales, filtered by distance. Each column of an
-image is one ray against the walls; rows follow from the distance. A panorama is a cylinder of 360 degrees,
-the other camera a pinhole.
+image is one ray against the walls; rows follow from the distance.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -90,34 +88,27 @@ class CorridorLoop:
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera of `fov_deg` degrees across `width` pixels; 360: a cylinder, else a pinhole. `exposure` is a
-    factor on the light, `noise` the standard deviation of a pixel, grey values."""
+    """A pinhole of `fov_deg` degrees across `width` pixels. `exposure` is a factor on the light."""
 
-    fov_deg: float = 60.0
+    fov_deg: float
     width: int = 640
     height: int = 480
     exposure: float = 1.0
-    noise: float = 2.0
 
     def frames(self, world: CorridorLoop) -> Iterator[np.ndarray]:
         """Images [H, W] uint8 at the times of `world.truth`."""
         random = np.random.default_rng([world.seed, 2])
         for pose in world.truth[1]:
             grey = 255 * self.exposure * self._light(world, pose)
-            grey += self.noise * random.standard_normal((self.height, self.width), np.float32)
+            grey += 2.0 * random.standard_normal((self.height, self.width), np.float32)
             yield np.clip(np.round(grey), 0, 255).astype(np.uint8)
 
     def _light(self, world: CorridorLoop, pose: np.ndarray) -> np.ndarray:
         """[H, W] light that falls into each pixel, 0..1."""
         across = (np.arange(self.width) + 0.5) / self.width - 0.5
-        fov = np.deg2rad(self.fov_deg)
-        if self.fov_deg == 360:
-            angle, depth = -across * fov, np.ones(self.width)
-            focal = self.width / fov
-        else:
-            focal = self.width / 2 / np.tan(fov / 2)
-            angle = -np.arctan(across * self.width / focal)
-            depth = np.cos(angle)
+        focal = self.width / 2 / np.tan(np.deg2rad(self.fov_deg) / 2)
+        angle = -np.arctan(across * self.width / focal)
+        depth = np.cos(angle)
         distance, along = _nearest_wall(world.walls, pose, pose[2] + angle)
         rise = (self.height / 2 - np.arange(self.height) - 0.5) / focal  # per metre of depth
         hit = EYE + rise[:, None] * (distance * depth)[None, :]  # height at which a ray meets the wall
@@ -160,26 +151,21 @@ def _sample(levels: list[np.ndarray], u: np.ndarray, v: np.ndarray, footprint: n
     return flat[starts[level] + i * columns + j]
 
 
-def write_video(
-    path: Path, frames: Iterator[np.ndarray], rate: float, codec: str = "MJPG", quality: int = 90
-) -> int:
+def write_video(path: Path, frames: Iterator[np.ndarray], rate: float, codec: str) -> int:
     """Writes grey frames as a video and returns their number; `MJPG` stores each as a JPEG."""
     import cv2
 
-    first = next(frames)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), rate, first.shape[::-1])
+    images = list(frames)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), rate, images[0].shape[::-1])
     assert writer.isOpened()
-    writer.set(cv2.VIDEOWRITER_PROP_QUALITY, quality)
-    count = 0
-    for frame in chain([first], frames):
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
-        count += 1
+    writer.set(cv2.VIDEOWRITER_PROP_QUALITY, 90)
+    for image in images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     writer.release()
-    return count
+    return len(images)
 
 
 def write_csv(path: Path, **columns: np.ndarray) -> Path:
-    """Writes columns of equal length as a CSV file."""
     table = np.column_stack(list(columns.values()))
     np.savetxt(path, table, fmt="%.9f", delimiter=",", header=",".join(columns), comments="")
     return path

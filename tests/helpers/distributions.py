@@ -5,11 +5,7 @@ from pathlib import Path
 
 
 def install(folder: Path, name: str, module: str, entry_points: Mapping[str, str]) -> None:
-    """Installs a package of version 1.0 with one module.
-
-    Args:
-        module: source of the module `NAME`. entry_points: object by `group:name`.
-    """
+    """Installs a package of version 1.0 with one module; entry points: object by `group:name`."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.py").write_text(module, encoding="utf-8")
     metadata = folder / f"{name}-1.0.dist-info"

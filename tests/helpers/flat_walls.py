@@ -6,6 +6,7 @@ from tactile.base.types import MotionKind, Odometry, Report, StepEnd
 from tactile.wall_estimation.report_frontend import ReportFrontendConfig
 
 RATE, SPEED, CONTACT = 2000.0, 0.02, 2e-4
+SECONDS = np.arange(4000) / RATE
 FEELERS = ReportFrontendConfig().feelers
 POINTING = np.arctan2(*FEELERS.direction.T[::-1])
 LENGTH = 0.14
@@ -13,19 +14,9 @@ TAPER = (1 - 0.3 / 1.45) / LENGTH
 STIFF = 3 * 0.725e-3  # strain a radian and 1/m
 
 
-def wall(
-    angle: float,
-    random: np.random.Generator | None = None,
-    *,
-    noise: float = 4e-6,
-    duration: float = 2.0,
-    first: int | None = None,
-) -> np.ndarray:
-    """[T, W, 2] from first contact on, at a wall of that direction (rad in base_link).
-
-    Args:
-        first: the only whisker that this wall is long enough for; None: it is endless.
-    """
+def wall(angle: float, random: np.random.Generator | None = None, *, first: int | None = None) -> np.ndarray:
+    """[T, W, 2] from first contact on, at a wall of that direction (rad in base_link), which is long enough
+    for the whisker `first` only, or endless."""
     normal = np.array([np.sin(angle), -np.cos(angle)])
     beta = angle - POINTING
     nearer, side = np.minimum(beta, np.pi - beta), np.where(beta < np.pi / 2, 1, -1)
@@ -43,11 +34,11 @@ def wall(
     far = float(room[there & (nearer > 0)].max())
     approach = far - np.linspace(0, 0.05, 5001)
     hit = approach[np.argmax(np.abs(strain(approach)[..., 0]).max(axis=1) > CONTACT)]
-    read = strain(hit - SPEED * np.sin(angle) * np.arange(round(duration * RATE)) / RATE)
-    return read if random is None else read + noise * random.standard_normal(read.shape)
+    read = strain(hit - SPEED * np.sin(angle) * SECONDS)
+    return read if random is None else read + 4e-6 * random.standard_normal(read.shape)
 
 
-def post(whisker: int, along: float, duration: float = 2.0) -> np.ndarray:
+def post(whisker: int, along: float) -> np.ndarray:
     """[T, W, 2] as one whisker is bent about a post that it met so far along its shaft, m."""
     away = along * FEELERS.direction[whisker] - np.outer(0.05 * np.arange(200) / 200 + 1e-6, [1.0, 0.0])
 
@@ -57,9 +48,8 @@ def post(whisker: int, along: float, duration: float = 2.0) -> np.ndarray:
         return np.where(reach < LENGTH, STIFF * (1 / reach - TAPER) * turn, 0.0)
 
     begun = away[np.argmax(np.abs(strain(away)) > CONTACT)]
-    time = np.arange(round(duration * RATE)) / RATE
-    across = strain(begun - np.outer(SPEED * time, [1.0, 0.0]))
-    read = np.zeros((len(time), 4, 2))
+    across = strain(begun - np.outer(SPEED * SECONDS, [1.0, 0.0]))
+    read = np.zeros((len(SECONDS), 4, 2))
     read[:, whisker] = np.stack([across, 0.08 * across - 0.05 * np.abs(across)], axis=-1)
     return read
 
@@ -71,18 +61,17 @@ def report(
     contact: tuple[int, ...] = (),
     strain: np.ndarray | None = None,
     odometry: Odometry | None = None,
-    rate: float = RATE,
 ) -> Report:
     """A report; that of FWD2 if it has strain."""
     strain = np.zeros((0, 4, 2)) if strain is None else strain
-    seconds = len(strain) / rate
+    seconds = len(strain) / RATE
     return Report(
         odometry or (Odometry(SPEED * seconds, 0.0, 0.0, seconds) if seconds else Odometry(0.025, 0, 0, 0.5)),
         int(motion),
         int(moment),
         np.ones(4, bool),
         np.isin(np.arange(4), contact),
-        np.arange(len(strain)) / rate,
+        np.arange(len(strain)) / RATE,
         strain,
     )
 

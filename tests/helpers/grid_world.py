@@ -19,24 +19,19 @@ from tactile.whisker_geometry import PlanarWhiskers
 MOUNTS = ((0.10, 0.08, 50), (0.13, 0.03, 15), (0.13, -0.03, -15), (0.10, -0.08, -50))
 """x m, y m, direction deg, of a Create's whiskers from left to right."""
 LENGTH = 0.14
-RADIUS = 0.13
-"""Distance along a whisker at which contacts are reported, m (Fox et al. 2012, II-D)."""
 STEADY = {"session": 0.0, "move": 0.0, "step": 0.0, "heading": 0.0}
 """Drift settings without odometry errors."""
-BLANK = {"edge": 0.0, "blob": 0.0, "free": 0.0, "body": 0.0}
-"""Footprint settings that leave the map unchanged."""
 
 
 def create(whiskers: int = len(MOUNTS)) -> PlanarWhiskers:
-    """The first few feelers of a Create."""
     mounts = np.array(MOUNTS)[:whiskers]
     angle = np.radians(mounts[:, 2])
     direction = np.column_stack([np.cos(angle), np.sin(angle)])
     return PlanarWhiskers(mounts[:, :2], direction, np.full(len(mounts), LENGTH))
 
 
-TIPS = create().points(np.array([RADIUS / LENGTH]))[:, 0]
-"""[W, 2] contact points in base_link, m."""
+TIPS = create().points(np.array([0.13 / LENGTH]))[:, 0]
+"""[W, 2] contact points in base_link, m: 0.13 m along a whisker (Fox et al. 2012, II-D)."""
 
 
 def report(
@@ -78,7 +73,6 @@ def filter_of(
 
 
 def settings(**parts: Any) -> GridConfig:
-    """A configuration with few particles by default."""
     return GridConfig.model_validate({"particles": 30} | parts)
 
 
@@ -106,12 +100,10 @@ def drive(
 
 
 def initial(backend: GridBackend, seed: int = 0) -> GridState:
-    """The initial state."""
     return backend.init(jax.random.key(seed), 256)
 
 
 def at_pose(state: GridState, pose: Sequence[float]) -> GridState:
-    """All particles at one pose."""
     there = jnp.broadcast_to(jnp.asarray(pose, state.particles.pose.dtype)[None], state.particles.pose.shape)
     return state._replace(particles=state.particles._replace(pose=there))
 

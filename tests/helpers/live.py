@@ -17,11 +17,7 @@ PATIENCE = 60.0
 
 
 class Faults:
-    """The fault port of a running emulator: `faults(do="stall", seconds=3)` returns its answer.
-
-    Attributes:
-        process: the emulator. host: its address. config: the settings it was started with.
-    """
+    """The fault port of a running emulator: `faults(do="stall", seconds=3)` returns its answer."""
 
     def __init__(self, process: subprocess.Popen[bytes], host: str, port: int) -> None:
         self.process, self.host, self._port = process, host, port
@@ -43,7 +39,6 @@ class Faults:
         return answer
 
     def state(self) -> dict[str, Any]:
-        """The state of the emulator."""
         return self(do="state")
 
     def die(self) -> None:

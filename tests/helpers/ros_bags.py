@@ -29,15 +29,10 @@ KINDS = {
     "mcap-message": (StoragePlugin.MCAP, CompressionMode.MESSAGE),
     "mcap-storage": (StoragePlugin.MCAP, CompressionMode.STORAGE),
 }
-"""Kinds of bags."""
 
 
 class Entry(NamedTuple):
-    """A message of a bag.
-
-    Attributes:
-        time: of receipt, ns. fields: of the message, nested; absent ones are 0.
-    """
+    """A message of a bag: time of receipt, ns; nested fields, of which absent ones are 0."""
 
     topic: str
     kind: str
@@ -71,7 +66,6 @@ def write_bag(folder: Path, kind: str, entries: Sequence[Entry], *, little_endia
 
 
 def built(typestore: Any, msgtype: str, fields: Mapping[str, Any]) -> Any:
-    """A message with these fields, the others 0."""
     found = {}
     for name, description in typestore.fielddefs[msgtype][1]:
         found[name] = _value(typestore, description, fields.get(name))

@@ -5,8 +5,6 @@ neighbours are as different as any. Odometry has noise, a scale error of its tur
 traces have.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from robot.sources.in_memory import InMemorySource
@@ -17,29 +15,13 @@ CELL = 0.1
 STEP = 0.05
 
 
-def square(seed: int, laps: int = 3, jumps: tuple[tuple[int, int], ...] = ()) -> InMemorySource:
-    """Laps of a 1 m square, turning on the spot at its corners, like a_square3.
-
-    Args:
-        jumps: (row, places): at that row the robot is carried so many places ahead, unknown to its odometry,
-            like e_kidnap.
-    """
+def square(seed: int, laps: int) -> InMemorySource:
+    """Laps of a 1 m square, turning on the spot at its corners, like a_square3."""
     side = [(STEP, 0.0)] * 20 + [(0.0, np.pi / 18)] * 9
-    path = followed(side * 4 * (laps + sum(places for _, places in jumps) // 116 + 1))
-    rows = np.arange(116 * laps + 1)
-    for row, places in jumps:
-        rows[row:] += places
-    return sensed(path[rows], seed, carried=[row for row, _ in jumps])
+    return sensed(followed(side * 4 * laps), seed)
 
 
-def figure_eight(seed: int, laps: int = 6, shared: float = 1 / 3) -> InMemorySource:
-    """Two circles in turn, like b_figure8_alias: a share of the second one's places look like the first's."""
-    left, right = [(STEP, np.pi / 18)] * 36, [(STEP, -np.pi / 18)] * 36
-    return sensed(followed((left + right) * laps), seed, shared=shared)
-
-
-def corridor(seed: int, length: int = 400) -> InMemorySource:
-    """A straight path without any revisit."""
+def corridor(seed: int, length: int) -> InMemorySource:
     return sensed(followed([(STEP, 0.0)] * length), seed)
 
 
@@ -52,18 +34,12 @@ def followed(moves: list[tuple[float, float]]) -> np.ndarray:
     return np.stack([x, y, heading], axis=1)
 
 
-def sensed(path: np.ndarray, seed: int, carried: Sequence[int] = (), shared: float = 0.0) -> InMemorySource:
-    """Log of a robot on a path [N, 3].
-
-    Args:
-        carried: rows whose motion odometry lacks. shared: share of places with the view of another one.
-    """
+def sensed(path: np.ndarray, seed: int) -> InMemorySource:
+    """Log of a robot on a path [N, 3]."""
     stream = np.random.default_rng(seed)
     count = len(path)
     motion = np.zeros((count, 4))
     motion[1:, :3] = between(path[:-1], path[1:])
-    for row in carried:
-        motion[row, :3] = STEP, 0.0, 0.0
     scale, bias = stream.normal(1, 0.015), stream.normal(0, 0.002)
     motion[1:, 0] += stream.normal(0, 0.001, count - 1)
     motion[1:, 2] = motion[1:, 2] * scale + bias + stream.normal(0, 0.005, count - 1)
@@ -73,14 +49,11 @@ def sensed(path: np.ndarray, seed: int, carried: Sequence[int] = (), shared: flo
     keys = np.concatenate([np.floor(path[:, :2] / CELL + 0.5), bucket], axis=1)
     _, first, place = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     looks = stream.random((len(first), 18))
-    alike = stream.random(len(first)) < shared / 2
-    looks[alike] = looks[stream.permutation(len(first))[: alike.sum()]]
     views = np.clip(looks[place.reshape(-1)] + stream.normal(0, 0.012, (count, 18)), 0, 1)
     return recorded(path, motion, views)
 
 
 def recorded(path: np.ndarray, motion: np.ndarray, views: np.ndarray) -> InMemorySource:
-    """A log of these rows."""
     count = len(path)
     yes, label = np.ones(count, bool), np.full(count, -1, np.int32)
     return InMemorySource(

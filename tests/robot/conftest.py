@@ -6,6 +6,7 @@ import pytest
 from tactile.base.errors import InputError
 
 
+<<<<<<< HEAD
 @pytest.fixture(scope="session")
 def find_trace(golden, request):
     """Finds the path of a reference trace, in the project's golden files or among the recordings."""
@@ -15,6 +16,12 @@ def find_trace(golden, request):
         return own if own.is_file() else request.getfixturevalue("reference_data") / "traces" / own.name
 
     return find
+=======
+@pytest.fixture(params=SYNTHETIC)
+def trace(request: pytest.FixtureRequest, find_trace: Callable[[str], Path]) -> Path:
+    """Each synthetic reference trace."""
+    return find_trace(request.param)
+>>>>>>> 392b16eae405848d190002f8c762a8311f2a8640
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@
 writes FORMAT.npz and FORMAT.csv into this folder: the map after the first 360 readings of `touch_circuits` (a
 whisker head in a maze), and the poses (x m, y m, heading rad) of all steps after 160 more. Files of earlier
 formats stay as they are, and their poses are made anew where a later version goes on differently:
-`tests/ratslam/runs/test_map_formats.py` opens each.
+`tests/ratslam/runs/test_saved_map.py` opens each.
 """
 
 from __future__ import annotations

@@ -125,6 +125,7 @@ def test_whisker_images_read_back_within_one_grey_level_with_equal_bytes(tmp_pat
 MAP = OccupancyGrid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.1]]), np.array([-1.25, 0.5]), 0.05)
 """Two rows, the first one below the second."""
 PROBABILITIES = arrays(np.float64, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.floats(0, 1))
+PLACES = st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)).map(np.array)
 
 
 @given(PROBABILITIES, st.floats(-1e3, 1e3), st.floats(1e-6, 2))
@@ -154,9 +155,6 @@ def test_spoilt_and_foreign_archives_are_refused(tmp_path, read, whole, odd):
             read(tmp_path / f"{name}.npz")
 
 
-places = st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)).map(np.array)
-
-
 @pytest.fixture
 def folder(tmp_path):
     write_nav2(tmp_path, MAP)
@@ -164,7 +162,7 @@ def folder(tmp_path):
 
 
 @settings(max_examples=40)
-@given(st.builds(OccupancyGrid, PROBABILITIES, places, st.floats(1e-6, 2)))
+@given(st.builds(OccupancyGrid, PROBABILITIES, PLACES, st.floats(1e-6, 2)))
 def test_cells_read_back_as_occupied_free_or_unknown(grid):
     """Numbers have no exponent: PyYAML reads 1e-05 as a string."""
     with tempfile.TemporaryDirectory() as folder:

@@ -121,8 +121,7 @@ def test_a_registered_metric_is_on_the_scorecard(circle, monkeypatch):
 def test_a_log_is_scored_in_all_modes(square):
     ids, truth = square(3, 4)
     ids[64:][ids[64:] == 3] = 7
-    card = score_log((np.arange(96.0), ids, truth), "my system")
-    found = values(card)
+    found = values(score_log((np.arange(96.0), ids, truth), "my system"))
     assert (found["exm_base"], found["exm_arr"], found["duration"]) == (32, 1.0, 95)
     rates = [found[f"exm_arcr_{mode}"] for mode in ("strict", "paper", "or", "literal")]
     assert rates == [0.9375, 0.875, 0.96875, 0]

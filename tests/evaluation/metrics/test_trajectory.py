@@ -1,5 +1,9 @@
-"""Alignment, ATE, RPE, online errors, energies, TUM files, and statistics of rates."""
+"""Alignment, ATE, RPE (also of evo), energies, TUM files, rates; errors known of published recordings."""
 
+import os
+import re
+import shutil
+import subprocess
 from itertools import combinations
 
 import numpy as np
@@ -8,12 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaluation.metrics import energy_metric, trajectory
-from evaluation.metrics.energy_metric import energy, energy_all_pairs
+from evaluation.metrics.energy_metric import (
+    energy,
+    energy_all_pairs,
+)
 from evaluation.metrics.run_metrics import energy_within_pieces, unjoined_share
 from evaluation.metrics.statistics import bootstrap, expected_calibration_error, wilson_interval
 from evaluation.metrics.trajectory import ate, online_errors, read_tum, rpe, successive_pairs, write_tum
 from tactile.base.errors import InputError
-from tactile.base.se2 import between, compose, wrap
+from tactile.base.se2 import between, compose, integrate, wrap
 
 law = settings(max_examples=50)
 motions = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-np.pi, np.pi)).map(np.array)
@@ -207,3 +214,65 @@ def test_calibration_and_bootstrap_of_known_values():
     # of the normal approximation, within a tenth
     assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(30), rel=0.1)
     assert np.isnan(bootstrap(np.zeros(0), "a")).all()
+
+
+def dead_reckoning(trace):
+    """Raw odometry [N, 3]: a step goes along its new heading, and the first row only sets the clock."""
+    dt = np.diff(trace["in_t"], prepend=trace["in_t"][0])
+    way, turn = trace["in_v"] * dt, trace["in_w"] * dt
+    return integrate(np.stack([way * np.cos(turn), way * np.sin(turn), turn], axis=1))
+
+
+def final_map(trace):
+    """Final position [N, 3] of each row's experience; node 0 before there is any."""
+    return trace["map_final"][trace["out_em_exp"].astype(int), 1:4]
+
+
+@pytest.mark.parametrize(("name", "odometry", "reference", "digit"), [
+    ("f_real_intel_laser3x6", 24.16, 9.83, 0.01),
+    ("f_real_tuc_lecture_hall", 12.95, 3.03, 0.01),
+    ("b_figure8_alias", 0.174, 0.742, 0.001),
+    ("a_square3", 0.248, 0.044, 0.001),
+    ("e_kidnap", 0.764, 0.432, 0.001),
+])  # fmt: skip
+def test_ate_of_odometry_and_of_the_reference_map(find_trace, name, odometry, reference, digit):
+    run = np.load(find_trace(name))
+    assert ate(dead_reckoning(run), run["truth"]) == pytest.approx(odometry, abs=digit / 2)
+    assert ate(final_map(run), run["truth"]) == pytest.approx(reference, abs=digit / 2)
+
+
+def test_relations_of_the_intel_lab(reference_data, find_trace):
+    relations = energy_metric.read_relations(reference_data / "data" / "intel_relations.csv")
+    rows = np.loadtxt(reference_data / "data" / "intel_odom_gt.csv", delimiter=",", skiprows=1)
+    time, odometry, truth = rows[:, 0], rows[:, 1:4], rows[:, 4:]
+    run = np.load(find_trace("f_real_intel_laser3x6"))
+
+    def errors(pose):
+        return energy_metric.relation_errors(time, pose, relations)
+
+    assert errors(truth) == pytest.approx((0.126, 4.11, 2983, 1), abs=0.005)
+    # raw odometry is the recording's own pose columns; the trace's has lost its lateral part
+    assert errors(odometry)[:2] == pytest.approx((7.43, 40.9), abs=0.005)
+    assert errors(dead_reckoning(run))[:2] == pytest.approx((7.506, 40.9), abs=0.005)
+    assert errors(final_map(run))[:2] == (pytest.approx(1.385, abs=0.001), pytest.approx(25.9, abs=0.05))
+
+
+def test_ate_and_rpe_agree_with_evo(tmp_path):
+    if not (shutil.which("evo_ape") and shutil.which("evo_rpe")):
+        pytest.skip("evo's command line is not installed")
+
+    def evo(command, *options):
+        line = [command, "tum", tmp_path / "truth.tum", tmp_path / "estimate.tum", *options]
+        env = {**os.environ, "HOME": str(tmp_path), "MPLBACKEND": "Agg"}
+        done = subprocess.run(line, env=env, capture_output=True, text=True, timeout=120, check=True)
+        return float(re.search(r"rmse\s+(\S+)", done.stdout)[1])
+
+    random = np.random.default_rng(8)
+    truth = np.cumsum(random.normal(size=(80, 3)) * [0.3, 0.3, 0.4], axis=0)
+    estimate = truth + random.normal(0, 0.1, truth.shape)
+    write_tum(tmp_path / "truth.tum", np.arange(80.0), truth)
+    write_tum(tmp_path / "estimate.tum", np.arange(80.0), estimate)
+    assert evo("evo_ape", "--align") == pytest.approx(ate(estimate, truth), abs=2e-6)
+    assert evo("evo_rpe") == pytest.approx(rpe(estimate, truth)[0], abs=2e-6)
+    found = evo("evo_rpe", "--pose_relation", "angle_deg", "--delta", "5", "--all_pairs")
+    assert found == pytest.approx(np.degrees(rpe(estimate, truth, step=5)[1]), abs=2e-6)

@@ -1,13 +1,12 @@
-"""What figures draw is where the arrays say; runs without a part are drawn as well; plots of a session."""
+"""What figures draw is where the arrays say; runs without a part are drawn as well."""
 
 import io
-import shutil
 
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PatchCollection
 
-from evaluation.artifacts.run_reader import WhiskerViews, read_walls, read_whisker_views
+from evaluation.artifacts.run_reader import WhiskerViews
 from evaluation.cells.rate_map import arena_edges, bin_activity, rate_maps
 from evaluation.cells.recording import CellRecording
 from evaluation.metrics.exm import experience_metric
@@ -17,13 +16,7 @@ from evaluation.plots.cell_plot import choose_cells, draw_recorded_cells, draw_s
 from evaluation.plots.experience_plot import draw_experience_history
 from evaluation.plots.grid_plot import GridPanel, draw_grid, draw_grids
 from evaluation.plots.map_plot import draw_map, map_headline, split_at_jumps
-from evaluation.plots.run_plots import plot_writers
 from evaluation.plots.whisker_plot import MAX_HEADS, draw_whiskers
-from ratslam.cli import main
-from ratslam.runs.build_session import open_source
-from ratslam.runs.settings.run_config import RunConfig, load_config
-from robot.touch_source import open_touch_source
-from robot.world.scene import MazeConfig
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, inverse
 from tests.evaluation.cells.box_walk import place_cells, random_walk, sheet_recording
@@ -239,51 +232,3 @@ def test_sessions_of_any_length_are_drawn_with_some_images_at_their_poses(circle
         assert len(rings) == (1 if steps == 1 else MAX_HEADS)
     with pytest.raises(InputError, match=r"views\.npz"):
         draw_whiskers(run, score_run(run), random_images(steps + 1))
-
-
-PICTURES = ("map.png", "whiskers.png", "experiences.png")
-KEPT = ("walls.csv", "views.npz", "maze.txt")
-CONFIG = """
-simulation: {path: {explore: 40}, maze: {heights: [0.03, 0.05]}, seed: 3}
-touch: {head: {dead: [4]}}
-"""
-METHOD = "backend: classic\nsession: {reserve: 64}\n"
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A tiny whisker session: mapped directly, and from its recording."""
-    path = tmp_path_factory.mktemp("pictures")
-    (path / "config.yaml").write_text(CONFIG + METHOD)
-    (path / "replay.yaml").write_text("recording: {file: session.mcap}\n" + METHOD)
-    assert main(["simulate", str(path / "config.yaml"), "-o", str(path / "session.mcap")]) == 0
-    assert main(["run", str(path / "config.yaml"), "-o", str(path / "run")]) == 0
-    assert main(["run", str(path / "replay.yaml"), "-o", str(path / "replayed")]) == 0
-    return path
-
-
-def test_plots_are_made_again_from_the_directory_alone_which_keeps_views_and_walls(folder, tmp_path):
-    elsewhere = tmp_path / "moved"
-    shutil.copytree(folder / "run", elsewhere, ignore=shutil.ignore_patterns("*.png"))
-    for name, save in plot_writers(elsewhere).items():
-        save(elsewhere / name)
-    for name in PICTURES:
-        assert (elsewhere / name).read_bytes() == (folder / "run" / name).read_bytes(), name
-    for name in KEPT:
-        assert (folder / "replayed" / name).read_bytes() == (folder / "run" / name).read_bytes(), name
-    config = load_config(folder / "config.yaml")
-    source = open_source(config)
-    boxes = source.scene.surroundings.walls
-    assert np.array_equal(read_walls(folder / "run"), np.column_stack(boxes))
-    assert len(np.unique(boxes.height)) == 2
-    given = [sample.reading for sample in open_touch_source(source, config.touch)]
-    images = read_whisker_views(folder / "run" / "views.npz")
-    assert np.abs(images.view - np.array([g.view[..., 0] for g in given])).max() <= 1 / 255
-    assert np.array_equal(images.alive.reshape(-1, 18), np.array([g.alive for g in given]))
-    assert not images.alive[:, 0, 4].any()
-    assert images.azimuth == pytest.approx(np.radians([0, 60, 120, 180, -120, -60]))
-    assert images.length == pytest.approx([0.05, 0.11, 0.16])
-    assert sum((folder / "run" / name).stat().st_size for name in KEPT) < 10_000
-    kept = MazeConfig(file=folder / "run" / "maze.txt")
-    config = RunConfig.model_validate({"simulation": {"maze": kept, "path": {"explore": 5}}})
-    assert open_source(config).length == 5

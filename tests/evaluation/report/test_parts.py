@@ -22,8 +22,6 @@ from evaluation.report.run_report import VIEW_BYTES, closure_records, halve, vie
 from evaluation.report.verdict import describe_score, judge_map
 from tactile.base.se2 import compose
 
-ROOT = Path(__file__).parents[3]
-
 
 def test_the_verdict_follows_the_doubt_and_an_unjudged_map_says_why() -> None:
     for doubt, level, share in (

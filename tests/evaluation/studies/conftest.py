@@ -3,8 +3,6 @@
 import json
 import os
 import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -15,8 +13,8 @@ from evaluation.metrics.metric import Quantity
 from evaluation.studies.machine import machine
 from evaluation.studies.run_job import RunRecord
 from evaluation.studies.study import Job
+from tests.helpers.live import until
 
-ROOT = Path(__file__).parents[3]
 PATIENCE = 240.0
 TINY = {
     "simulation.maze": {"columns": 3, "rows": 2, "loop": 6},
@@ -29,29 +27,14 @@ TINY = {
 """Some 40 whisks."""
 
 
-def start(*arguments: object) -> subprocess.Popen[str]:
-    """The program in a process group of its own; it heeds the interrupts that background programs ignore."""
-    code = (
-        "import signal, sys; from ratslam.__main__ import main; "
-        "signal.signal(signal.SIGINT, signal.default_int_handler); sys.exit(main(sys.argv[1:]))"
-    )
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments)], cwd=ROOT, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
-
-
 def preset(name: str, config: Path, assignments: Iterable[str], output: Path) -> list[str]:
     given = [part for each in assignments for part in ("--set", each)]
     return ["study", "--preset", name, str(config), *given, "-o", str(output)]
 
 
 def wait_until(ready: Callable[[], object], process: subprocess.Popen[str]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not ready():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    until(lambda: ready() or process.poll() is not None, seconds=PATIENCE)
+    assert ready(), process.communicate()
 
 
 def kill(process: subprocess.Popen[str], number: int) -> tuple[str, str]:
@@ -61,7 +44,6 @@ def kill(process: subprocess.Popen[str], number: int) -> tuple[str, str]:
 
 
 def record(row="", seed=0, time=100.0, error=None, varied=None, odometry=None, hash=None, **values):
-    """A record without a run."""
     told = {"unit": "", "odometry": odometry}
     quantities = {name: Quantity(label=name, value=value, **told) for name, value in values.items()}
     measured = {"step_time": time, "step_time_p99": 2 * time, "run_time": 3 * time, "compile_time": 1.0}

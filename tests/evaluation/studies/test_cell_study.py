@@ -22,7 +22,8 @@ from ratslam.runs.build_session import build_session, open_observations, read_ob
 from ratslam.runs.settings.run_config import load_config
 from tactile.base.errors import InputError
 from tactile.base.types import Odometry
-from tests.evaluation.studies.conftest import kill, preset, start, wait_until
+from tests.evaluation.studies.conftest import kill, preset, wait_until
+from tests.helpers.commands import said, start
 
 SMALL = ["sets=4", "steps=100", "chunk=2", "bins=5", "pose_cells.cells_xy=11", "pose_cells.cells_heading=12"]
 STILL = {"truth": np.zeros((200, 3)), "in_v": np.zeros(200), "in_w": np.zeros(200)}
@@ -129,8 +130,8 @@ def test_an_interrupted_or_larger_study_computes_only_what_is_missing(box, tmp_p
 
 def test_the_program_writes_table_maps_and_pictures(box, tmp_path, capsys):
     output = tmp_path / "out"
-    assert main(command(box(), [*SMALL, "views=true"], output)) == 0
-    assert (output / "table.md").read_text().strip() in capsys.readouterr().out
+    printed = said(capsys, *command(box(), [*SMALL, "views=true"], output))
+    assert (output / "table.md").read_text().strip() in printed
     rows = list(csv.DictReader((output / "table.csv").read_text().splitlines()))
     assert [int(row["set"]) for row in rows] == [0, 1, 2, 3]
     assert all(float(row["drift"]) > 0 for row in rows)
@@ -166,12 +167,6 @@ def test_a_killed_study_continues_with_the_same_bytes_with_another_number_of_wor
 def test_unfit_settings_and_sessions_are_refused(box, changed, more, named):
     with pytest.raises(InputError, match=named):
         cell_study(box(**changed), more)
-
-
-@pytest.mark.parametrize("option", [["--search"], ["--error", "ate"]])
-def test_options_of_other_studies_are_refused(box, capsys, option):
-    assert main(["study", "--preset", "cells", str(box()), *option]) == 2
-    assert option[0] in capsys.readouterr().err
 
 
 CONFIG = NetworkConfig(cells_xy=21)
@@ -221,7 +216,6 @@ def alone(row: tuple[float, ...], given: CellCourse) -> tuple[np.ndarray, np.nda
 @pytest.mark.soak
 @pytest.mark.parametrize("views", [True, False])
 def test_networks_equal_those_simulated_one_by_one(views):
-    """With three networks in blocks of two."""
     given = course(views)
     segments = list(walk(CONFIG, sets(), given, CHOSEN, block=2))
     assert [segment.pose.shape[1] for segment in segments] == [SEGMENT, STEPS - SEGMENT]

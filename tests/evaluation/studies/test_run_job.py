@@ -26,8 +26,8 @@ from ratslam.runs.run import run
 from robot.recordings.mcap_writer import record_source
 from robot.recordings.npz_trace import read_trace
 from tactile.base.errors import InputError
+from tests.helpers.commands import ROOT
 
-ROOT = Path(__file__).parents[3]
 SMALL = {"simulation.path": {"circuits": "CC"}}
 
 

@@ -17,7 +17,6 @@ from evaluation.studies.run_job import RunLog, RunRecord
 from evaluation.studies.scene_statistics import Scene, scene_of, short_session, shortened, with_tier
 from evaluation.studies.study import with_settings
 from ratslam.classic.pose_cells import LARGEST_SUBSTEP
-from ratslam.cli import main
 from ratslam.grid.particles import LAYERS
 from ratslam.runs.build_session import open_source
 from ratslam.runs.settings.run_config import RunConfig
@@ -25,7 +24,8 @@ from ratslam.runs.settings.strict_yaml import load, override, parse, validate
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.world.maze import CELL_SIDE
 from tactile.base.errors import InputError
-from tests.evaluation.studies.conftest import ROOT, kill, preset, start, wait_until
+from tests.evaluation.studies.conftest import kill, preset, wait_until
+from tests.helpers.commands import ROOT, refused, said, start
 
 GOLDEN = ROOT / "tests" / "golden"
 LENGTHS = st.floats(1e-3, 1e3)
@@ -163,8 +163,7 @@ def stubbed(monkeypatch):
 def test_every_step_is_tried_on_the_same_short_session(tmp_path, capsys, stubbed):
     path, cells = tmp_path / "maze.yaml", "pose_cells: {cell_size: 0.005}\nattractor: {engine: dense}\n"
     path.write_text(f"simulation: {{fidelity: dynamic}}\n{cells}")
-    assert main(["size", str(path), "--cycles", "400"]) == 0
-    output = capsys.readouterr().out
+    output = said(capsys, "size", path, "--cycles", "400")
     first, second, *others = stubbed
     assert first.pose_cells.cell_size > 0.005
     assert (second.pose_cells.cell_size, second.attractor.engine) == (0.005, "dense")
@@ -187,10 +186,9 @@ def test_unfit_input_is_one_clear_error(content, arguments, named, tmp_path, cap
     (tmp_path / "config.yaml").write_text(content)
     rows = "".join(f"{k},0,0,0\n" for k in range(99))
     (tmp_path / "still.csv").write_text(f"t,x,y,heading\n{rows}")
-    assert main(["size", str(tmp_path / "config.yaml"), *arguments]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("ratslam: error: ")
-    assert named in line
+    error = refused(capsys, "size", tmp_path / "config.yaml", *arguments)
+    assert named in error
+    assert "\n" not in error
 
 
 SQUARE, MAZE = ROOT / "configs" / "square.yaml", ROOT / "configs" / "whisker_maze.yaml"
@@ -231,8 +229,8 @@ def test_perturbed_copies_are_run_beside_the_session(tmp_path, capsys):
     cells = "pose_cells: {cells_xy: 11, cells_heading: 12}\nbackend: classic\n"
     (tmp_path / "c.yaml").write_text(SMALL + cells)
     command = preset("spread", tmp_path / "c.yaml", ["copies=2"], tmp_path / "out")
-    assert main([*command, "--workers", "1"]) == 0
-    rows = [line.split("|")[1].strip() for line in capsys.readouterr().out.splitlines()[2:5]]
+    lines = said(capsys, *command, "--workers", "1").splitlines()
+    rows = [line.split("|")[1].strip() for line in lines[2:5]]
     assert rows == ["as recorded", "perturbed", "dead reckoning"]
     assert [each.copy_number for each in RunLog(tmp_path / "out").records.values()] == [0, 1, 2]
 
@@ -350,8 +348,10 @@ def test_unfit_settings_are_refused(config, settings, named):
         growth_study(config, settings)
 
 
-@pytest.mark.parametrize("option", [["--workers", "2"], ["--search"]])
-def test_options_of_other_studies_are_refused_before_anything_runs(config, tmp_path, capsys, option):
-    assert main([*preset("growth", config, [], tmp_path / "out"), *option]) == 2
-    assert option[0] in capsys.readouterr().err
+@pytest.mark.parametrize(("name", "option"), [
+    ("growth", ["--workers", "2"]), ("growth", ["--search"]),
+    ("cells", ["--search"]), ("cells", ["--error", "ate"]),
+])  # fmt: skip
+def test_options_of_other_studies_are_refused_before_anything_runs(config, tmp_path, capsys, name, option):
+    assert option[0] in refused(capsys, *preset(name, config, [], tmp_path / "out"), *option)
     assert not (tmp_path / "out").exists()

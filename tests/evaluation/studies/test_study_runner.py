@@ -8,11 +8,13 @@ import sys
 import time
 from dataclasses import replace
 
+import numpy as np
 import psutil
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evaluation.metrics.statistics import pareto_optimal
 from evaluation.studies.executor import Executor
 from evaluation.studies.metrics import MEASURED
 from evaluation.studies.parameter_search import search
@@ -21,13 +23,13 @@ from evaluation.studies.study import read_study
 from evaluation.studies.study_report import make_report
 from ratslam.cli import main
 from tactile.base.errors import InputError
-from tests.evaluation.studies.conftest import PATIENCE, kill, record, start, wait_until
+from tests.evaluation.studies.conftest import PATIENCE, kill, record, wait_until
+from tests.helpers.commands import said, start
 
 FULL = record("r", varied={"a.b": [1, {"c": None}]}, time=40.0, energy_all=0.1 + 0.2, exm_arr=None)
 
 
 def lines(output):
-    """Complete lines of the file of records."""
     path = output / FILE
     return path.read_bytes().splitlines(keepends=True) if path.exists() else []
 
@@ -143,8 +145,7 @@ def test_failed_runs_are_reported_and_the_others_continue(tiny, tmp_path, capsys
         assert (output / "table.csv").exists()
     assert len(stubbed) == 6
     (output / FILE).write_text((output / FILE).read_text().replace('"build":"', '"build":"0', 1))
-    assert main(["study", str(study), "-o", str(output), "--workers", "1"]) == 2
-    assert "2 builds" in capsys.readouterr().out
+    assert "2 builds" in said(capsys, "study", study, "-o", output, "--workers", "1", code=2)
 
 
 def test_killed_runs_are_tried_again_and_speed_is_measured_seed_by_seed(tiny, tmp_path, monkeypatch):
@@ -201,12 +202,6 @@ def tune(study, folder, done=None):
     return make_report(study.name, study.plan, records, search=True).rows
 
 
-def dominates(a, b):
-    """Low values of energy_all and high ones of exm_arr are better."""
-    values = [(one.spreads["energy_all"].mean, -one.spreads["exm_arr"].mean) for one in (a, b)]
-    return all(x <= y for x, y in zip(*values, strict=True)) and values[0] != values[1]
-
-
 @pytest.mark.parametrize("sampler", ["tpe", "nsga2"])
 def test_trials_are_within_bounds_and_the_optimal_ones_are_not_dominated(tiny, tmp_path, stubbed, sampler):
     plan = TUNE | {"sampler": sampler, "population": 4, "batch": 3}
@@ -217,7 +212,9 @@ def test_trials_are_within_bounds_and_the_optimal_ones_are_not_dominated(tiny, t
         assert 1 <= score <= 39
         assert trial.varied["recall.guard"] in range(1, 9)
         assert trial.spreads["energy_all"].mean == pytest.approx((score - 7) ** 2 + 0.5)
-        assert trial.optimal == (not any(dominates(other, trial) for other in trials))
+    # Low values of energy_all and high ones of exm_arr are better.
+    costs = [[one.spreads["energy_all"].mean, -one.spreads["exm_arr"].mean] for one in trials]
+    assert [trial.optimal for trial in trials] == pareto_optimal(np.array(costs)).tolist()
     different = {json.dumps(trial.varied) for trial in trials}
     assert len(different) > 8
     assert len(stubbed) == len(set(stubbed)) == 2 * len(different)
@@ -268,13 +265,11 @@ def test_a_failed_run_fails_its_trial_and_a_missing_optuna_is_reported(tiny, tmp
 
 def test_the_program_lists_the_optimal_trials(tiny, tmp_path, capsys, stubbed):
     output = tmp_path / "out"
-    study = str(tiny(tune=TUNE | {"minimise": ["steps"]}))
-    command = ["study", study, "-o", str(output), "--workers", "1", "--search"]
-    assert main(command) == 2
-    assert "14 trials, 0 of them Pareto-optimal" in capsys.readouterr().out  # no `steps` in stubs
+    study = tiny(tune=TUNE | {"minimise": ["steps"]})
+    command = ["study", study, "-o", output, "--workers", "1", "--search"]
+    assert "14 trials, 0 of them Pareto-optimal" in said(capsys, *command, code=2)  # no `steps` in stubs
     tiny(tune=TUNE)
-    assert main(command) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = said(capsys, *command).splitlines()
     trials = json.loads((output / "table.json").read_text())["rows"]
     best = [trial["row"] for trial in trials if trial["optimal"]]
     assert any(f"14 trials, {len(best)} of them Pareto-optimal" in line for line in lines)

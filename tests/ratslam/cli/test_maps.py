@@ -27,11 +27,10 @@ from robot.recordings.formats import open_recording
 from robot.recordings.recording_config import RecordingConfig
 from tactile.base.types import Odometry, observation
 from tests.helpers.commands import ROOT, SQUARE, contents, refused, said
-from tests.helpers.square_run import copy_square_run
 from tests.ratslam.places.test_route import TRAVEL, line_map, travel_graph
-from tests.ratslam.runs.test_map_formats import FILES
+from tests.ratslam.runs.test_saved_map import FILES
 
-FILE, MAP = ROOT / "tests" / "data" / "maps" / "ratslam-map-1.npz", str(FILES[-1])
+FILE, MAP = FILES[0], str(FILES[-1])
 READINGS = ROOT / "tests" / "golden" / "touch_circuits.mcap"
 
 
@@ -48,13 +47,8 @@ def test_info_says_what_is_in_a_map_and_an_undone_sequence_is_gone(capsys, tmp_p
     assert 300 < before["keyframes"] <= 360
     sequences = before["accepted_sequences"]
     assert before["closures"] >= len(sequences) > 0
-    text, sequence = said(capsys, "map", "info", FILE), sequences[0]["sequence"]
-    for words in (
-        before["digest"][:12], f"experiences {before['experiences']}; pieces 1",
-        f"closures    {before['closures']}, in {len(sequences)} accepted",
-        f"doubt       {before['doubt']:.2f}",
-    ):  # fmt: skip
-        assert words in text
+    sequence = sequences[0]["sequence"]
+    assert f"experiences {before['experiences']}; pieces 1" in said(capsys, "map", "info", FILE)
     said(capsys, "map", "undo", FILE, sequence, "-o", undone)
     after = info(capsys, undone)
     assert sequence not in {one["sequence"] for one in after["accepted_sequences"]}
@@ -72,8 +66,7 @@ def test_info_says_what_is_in_a_map_and_an_undone_sequence_is_gone(capsys, tmp_p
     assert "is not an accepted closure sequence" in refused(capsys, "map", "undo", own, sequence)
 
 
-def test_the_files_of_a_run_follow_a_map_that_is_corrected_in_it(capsys, tmp_path: Path) -> None:
-    run = copy_square_run(tmp_path / "run")
+def test_the_files_of_a_run_follow_a_map_that_is_corrected_in_it(capsys, tmp_path: Path, run: Path) -> None:
     sequence = info(capsys, run)["accepted_sequences"][-1]["sequence"]
     before = contents(run)
     said(capsys, "map", "undo", run, sequence, "-o", tmp_path / "undone.npz")
@@ -135,7 +128,6 @@ def test_maps_without_keyframes(capsys, tmp_path: Path) -> None:
     slam.save(file)
     found = info(capsys, file)
     assert (found["backend"], found["steps"], "keyframes" in found) == ("classic", 40, False)
-    assert "method      classic" in said(capsys, "map", "info", file)
     other = difference(capsys, file, FILE)
     assert (other["common"], other["settings"]["backend"]) == (0, ["classic", "recall"])
     for command, *part in (("undo", file, "0"), ("crop", file, "--piece", "0")):

@@ -22,8 +22,7 @@ from ratslam.cli import build_parser
 from ratslam.cli.common import CommandParser, Commands
 from ratslam.runs.map_care import map_info
 from ratslam.runs.saved_map import read_map
-from tests.helpers.commands import ROOT, SQUARE, contents, refused, said
-from tests.helpers.square_run import copy_square_run
+from tests.helpers.commands import ROOT, SQUARE, contents, copy_square_run, refused, said
 
 FILE = ROOT / "tests" / "data" / "maps" / "ratslam-map-1.npz"
 Words = tuple[str, ...]
@@ -48,11 +47,6 @@ def more_arguments(words: Words, value: str = "1") -> list[str]:
             given = value if action.type is Path else "1"
             more += [*action.option_strings[:1], str(next(iter(action.choices or [given])))]
     return more + ["--piece", "0"] * (words == ("map", "crop"))
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
-    return copy_square_run(tmp_path / "run")
 
 
 @contextmanager
@@ -191,13 +185,11 @@ def test_an_output_that_takes_no_text_is_one_error() -> None:
     assert found.stderr.count("\n") == 1
 
 
-TRACE = ROOT / "tests" / "golden" / "a_square3.npz"
-COLUMNS = "t,distance,turn\n0,0,0\n1,1,0\n"
 FILES = {
-    "taken": "mine", "taken.png": "mine", "taken.rrd": "mine", "taken.mcap": "mine", "empty/.keep": "",
+    "taken": "mine", "taken.rrd": "mine", "taken.mcap": "mine", "empty/.keep": "",
     "begun/manifest.json": "{}", "log.csv": "t,id\n0,1\n", "empty.mcap": "",
     "lab_truth.csv": "t,x,y,heading\n0,0,0,0\n1,1,0,0\n",
-    **dict.fromkeys(("notes.txt", "drive.csv"), COLUMNS),
+    **dict.fromkeys(("notes.txt", "drive.csv"), "t,distance,turn\n0,0,0\n1,1,0\n"),
     "two_errors.yaml": "pose_cells: {}\nplaces: {radius: 0}\n",
     "whisker_reach.yaml": "source: {plugin: whisker_reach, settings: {file: log.csv}}\n",
     "blank.yaml": "source: {plugin: whisker_stage, settings: {file: empty.mcap}}\n",
@@ -207,12 +199,10 @@ REFUSED = {
     "path MAP --from 0,nan --to 1": "--from: '0,nan' X,Y",
     "path MAP --to 1,2,3": "--to: '1,2,3' X,Y",
     "path MAP --to 1 -o way.txt": "way.txt .png",
-    "path MAP --to 1 -o taken.png": "taken.png: exists",
     "path MAP --to --json": "--to",
     "score empty": "online.tum",
     "score log.csv": "log.csv",
     "score log.csv --base -1": "--base: -1",
-    "watch none": "none: no",
     "watch taken": "taken: no",
     "watch run --every 0": "--every",
     "watch run --patience inf": "--patience",
@@ -238,7 +228,6 @@ REFUSED = {
     "run SQUARE --rerun taken.rrd": "taken.rrd: exists",
     "simulate SQUARE -o a.mcap": "simulation: missing",
     "live SQUARE": "live: missing",
-    "doctor nothing.bag": "nothing.bag: no such file",
     "doctor notes.txt": "no reader for '.txt'",
     "doctor drive.csv --set seed=1": "--set",
     "doctor SQUARE": "doctor --live",
@@ -322,7 +311,7 @@ def test_what_is_no_configuration_is_named_with_what_reads_it(command: str, tmp_
         (tmp_path / file).write_bytes(content)
     os.mkfifo(tmp_path / "fifo")
     shutil.copy(FILE, tmp_path / "map.npz")
-    shutil.copy(TRACE, tmp_path / "trace.npz")
+    shutil.copy(ROOT / "tests" / "golden" / "a_square3.npz", tmp_path / "trace.npz")
     for name, what in NO_CONFIG.items():
         error = refused(capsys, command, tmp_path / name)
         assert error.startswith(f"{tmp_path / name}: {what}; ")

@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,8 @@ from importlib.metadata import EntryPoint, version
 import numpy as np
 import pytest
 
+from evaluation.artifacts.run_reader import read_walls, read_whisker_views
+from evaluation.plots.run_plots import plot_writers
 from ratslam.cli import GROUPS, build_parser, main
 from ratslam.cli.common import Commands
 from ratslam.core.backend import NO_CLOSURE
@@ -25,7 +28,7 @@ from robot.recordings.mcap_writer import record_source
 from robot.recordings.recording_config import RecordingConfig
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.touch_source import open_touch_source
-from tests.helpers.commands import ROOT, SQUARE, said
+from tests.helpers.commands import ROOT, SQUARE, said, start
 
 FILES = {
     "online_error.csv", "calibration.yaml", "closures.csv", "config.yaml", "manifest.json", "map.g2o",
@@ -57,11 +60,8 @@ def test_without_closures_the_map_is_odometry(backend, tmp_path, capsys):
     found = json.loads((tmp_path / "run" / "scorecard.json").read_text())["health"]
     assert (found["worse_than_odometry"], found["reason"]) == (None, NO_CLOSURE)
     assert not (tmp_path / "run" / "calibration.yaml").exists()
-    *_, done, error, closures, warnings, health = text.splitlines()
-    assert re.fullmatch(rf"{tmp_path}/run: 349 steps of a_square3 by {backend}, \S+ s, \S+ m .*", done)
-    assert re.fullmatch(r"ATE, final \(RMS\): (\S+) m, odometry \1 m", error)
-    assert re.fullmatch("closures: (none|0 of .*)", closures)
-    assert (warnings, health) == ("warnings: none", f"health: input clean; {NO_CLOSURE}")
+    assert re.search(r"ATE, final \(RMS\): (\S+) m, odometry \1 m", text)
+    assert text.endswith(f"warnings: none\nhealth: input clean; {NO_CLOSURE}\n")
 
 
 @pytest.mark.soak
@@ -84,8 +84,12 @@ def test_a_cut_recording_is_recovered(tmp_path, capsys):
     assert f"good.mcap: {steps} samples; the rest is lost: " in text
 
 
-CONFIG = "simulation: {path: {explore: 150}, seed: 5}\ntouch: {head: {dead: [4]}}\n"
+CONFIG = """
+simulation: {path: {explore: 150}, maze: {heights: [0.03, 0.05]}, seed: 3}
+touch: {head: {dead: [4]}}
+"""
 SAME = ("trajectory.tum", "online.tum", "odometry.tum", "truth.tum", "steps.csv", "map.g2o", "map.json")
+KEPT = ("walls.csv", "views.npz", "maze.txt")
 
 
 @pytest.fixture(scope="module")
@@ -100,19 +104,45 @@ def folder(tmp_path_factory):
 
 
 def test_a_run_of_the_recording_equals_that_of_the_simulation_and_names_it(folder):
-    for name in SAME:
+    for name in (*SAME, *KEPT):
         assert (folder / "direct" / name).read_bytes() == (folder / "replayed" / name).read_bytes(), name
     assert (folder / "direct" / "steps.csv").read_text().count("\n") == 151
-    config = RunConfig.model_validate({"simulation": {"path": {"explore": 150}, "seed": 5}})
+    config = load_config(folder / "config.yaml")
     for name in ("direct", "replayed"):
         made = json.loads((folder / name / "manifest.json").read_text())["simulation"]
-        assert (made["seed"], made["tier"], bool(made["why"])) == (5, "kinematic", True)
+        assert (made["seed"], made["tier"], bool(made["why"])) == (3, "kinematic", True)
         assert made["sha256"] == Recording(folder / "session.mcap").info.simulation.sha256
         assert made["sha256"] != HeadSimulation(config.simulation).digest  # its head has a dead whisker
         manifest = json.loads((folder / "direct" / "manifest.json").read_text())
         assert manifest["recording"]["sha256"] == made["sha256"]
     config = load_config(folder / "replayed" / "config.yaml")
     assert (config.pose_cells.cell_size, config.touch.head.dead) == (0.05, (4,))
+
+
+def test_plots_are_made_again_from_the_directory_alone_which_keeps_views_and_walls(folder, tmp_path):
+    run, elsewhere = folder / "direct", tmp_path / "moved"
+    shutil.copytree(run, elsewhere, ignore=shutil.ignore_patterns("*.png"))
+    for name, save in plot_writers(elsewhere).items():
+        save(elsewhere / name)
+    for name in ("map.png", "whiskers.png", "experiences.png"):
+        assert (elsewhere / name).read_bytes() == (run / name).read_bytes(), name
+    config = load_config(folder / "config.yaml")
+    source = open_source(config)
+    boxes = source.scene.surroundings.walls
+    assert np.array_equal(read_walls(run), np.column_stack(boxes))
+    assert len(np.unique(boxes.height)) == 2
+    given = [sample.reading for sample in open_touch_source(source, config.touch)]
+    images = read_whisker_views(run / "views.npz")
+    assert np.abs(images.view - np.array([g.view[..., 0] for g in given])).max() <= 1 / 255
+    assert np.array_equal(images.alive.reshape(-1, 18), np.array([g.alive for g in given]))
+    assert not images.alive[:, 0, 4].any()
+    assert images.azimuth == pytest.approx(np.radians([0, 60, 120, 180, -120, -60]))
+    assert images.length == pytest.approx([0.05, 0.11, 0.16])
+    assert sum((run / name).stat().st_size for name in KEPT) < 10_000
+    config = RunConfig.model_validate(
+        {"simulation": {"maze": {"file": run / "maze.txt"}, "path": {"explore": 5}}}
+    )
+    assert open_source(config).length == 5
 
 
 def test_the_same_session_is_the_same_file_and_its_tier_is_printed(folder, tmp_path, capsys):
@@ -143,8 +173,7 @@ def test_a_recording_of_raw_samples_gives_the_observations_of_the_simulation(tmp
 def test_an_interrupted_session_is_complete_and_a_killed_one_readable(number, tmp_path):
     config, path = tmp_path / "long.yaml", tmp_path / "long.mcap"
     config.write_text("simulation: {path: {explore: 30000}, mechanics: {poses: 2}}\n")
-    command = [sys.executable, "-m", "ratslam", "simulate", str(config), "-o", str(path)]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = start("simulate", config, "-o", path)
     while process.poll() is None and not (path.exists() and path.stat().st_size > 30_000):
         time.sleep(0.005)
     process.send_signal(number)

@@ -23,8 +23,7 @@ from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import load_config
 from tactile.base import files
 from tactile.base.errors import InputError
-from tests.helpers.commands import ROOT, contents, refused, said
-from tests.helpers.square_run import copy_square_run
+from tests.helpers.commands import ROOT, contents, copy_square_run, refused, said, start
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +45,8 @@ def corridor(tmp_path_factory):
     return config, folder / "whole"
 
 
-def start(config, directory):
-    command = [sys.executable, "-m", "ratslam", "run", str(config), "-o", str(directory)]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-
-
 def wait_for_steps(process, directory, size=400):
-    """Waits until the file of steps has so many bytes (by default some lines beside the first one, of names),
-    or the process has ended."""
+    """Until the file of steps has so many bytes, by default some lines, or the process has ended."""
     steps = directory / "steps.csv"
     while process.poll() is None and not (steps.exists() and steps.stat().st_size > size):
         time.sleep(0.005)
@@ -63,7 +56,7 @@ def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path):
     """By SIGTERM, which does what Ctrl-C does but for the code."""
     config, whole = corridor
     first, second = tmp_path / "first", tmp_path / "second"
-    process = start(config, first)
+    process = start("run", config, "-o", first)
     wait_for_steps(process, first)
     process.send_signal(signal.SIGTERM)
     _, messages = process.communicate()
@@ -110,7 +103,7 @@ def check_killed_run(whole, directory):
 def kill_and_continue(config, whole, directory, moment):
     """Kills a run at a share of its steps (above 1: that much less 1, s, after the last) and continues it."""
     killed, rest = directory / "killed", directory / "rest"
-    process, size = start(config, killed), (whole / "steps.csv").stat().st_size
+    process, size = start("run", config, "-o", killed), (whole / "steps.csv").stat().st_size
     wait_for_steps(process, killed, min(moment, 1.0) * size - 1)
     if moment > 1:
         time.sleep(moment - 1)

@@ -33,8 +33,7 @@ SLACK = {"patience": 5.0, "silence": 2.0, "replug": 20.0, "stuck": 0.8}
 
 
 class Bench:
-    """An emulated arm and head at an address, by their faults; started when needed, and again after they
-    ended."""
+    """An emulated arm and head at an address, by their faults; started again after they ended."""
 
     arm: Faults
     head: Faults
@@ -95,19 +94,16 @@ class Bench:
         return usual | {name: value | settings.pop(name, {}) for name, value in parts.items()} | settings
 
     def moment(self) -> Moment:
-        """The present time by the devices' clocks."""
         return Moment(self.arm.state()["time"], self.head.state()["sequence"])
 
     def still(self) -> bool:
         return not self.arm.state()["moving"]
 
     def moves(self) -> bool:
-        """Whether the arm moves at full speed."""
         return float(np.linalg.norm(self.arm.state()["speed"][:3])) > 0.045
 
     def stands(self, within: float = PATIENCE) -> None:
-        """Checks that the program on the controller has ended and the arm stands within some s, so that
-        nothing can move it any more."""
+        """Checks that the controller's program has ended, so that nothing can move the arm, which stands."""
         if self.arm.process.poll() is not None:
             return  # the controller is gone
         until(lambda: self.arm.state()["runtime"] == "STOPPED" and self.still(), "the arm stands", within)
@@ -118,8 +114,7 @@ class Bench:
     def ended(
         self, session: Session, outcome: str, at: Moment | None = None
     ) -> tuple[dict[str, Any], RecordedData]:
-        """The report and the recording of a session that ended by itself, with that outcome and nothing lost
-        up to a moment."""
+        """The report and the recording of a session that ended so by itself, nothing lost up to a moment."""
         report = session.ends(outcome)
         self.stands()
         recorded = session.recorded()
@@ -151,11 +146,7 @@ def whisk_count(session: Session) -> int:
 
 
 class CreateBench:
-    """An emulated Create with whiskers at an address, started when needed and again after it ended.
-
-    Attributes:
-        port: its serial port, a link. whiskers: faults of their bridge.
-    """
+    """An emulated Create at an address: its serial port, a link, and faults of its whiskers' bridge."""
 
     whiskers: Faults
 
@@ -181,7 +172,6 @@ class CreateBench:
         self.port.unlink(missing_ok=True)  # its terminal's name is free for the next emulator
 
     def robot(self, do: str, **request: Any) -> dict[str, Any]:
-        """Executes a request of the robot and its line."""
         return self.whiskers(device="create", do=do, **request)
 
     def state(self) -> dict[str, Any]:
@@ -197,7 +187,6 @@ class CreateBench:
         return max(0.0, moments[-1] - moment)
 
     def live(self, silence: float = 5.0, **settings: Any) -> dict[str, Any]:
-        """The section `live` of a session on this robot."""
         head = {"address": self.host, "silence": silence}
         create = {"port": str(self.port), "plan": {**PLAN, "minutes": 1}, **settings}
         return {"head": head, "create": create, "room": 0.0, "residual": 1.0}

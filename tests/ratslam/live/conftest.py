@@ -25,7 +25,6 @@ def table(loopback: str, server: SessionServer, tmp_path_factory: pytest.TempPat
 
 @pytest.fixture
 def bench(table: Bench) -> Bench:
-    """Emulators in their initial state."""
     table.ready()
     return table
 
@@ -41,6 +40,5 @@ def create_table(
 
 @pytest.fixture
 def robot(create_table: CreateBench) -> CreateBench:
-    """An emulated Create without faults."""
     create_table.ready()
     return create_table

@@ -45,7 +45,6 @@ class RecordedData(NamedTuple):
 
 
 def read_recorded(path: Path) -> RecordedData:
-    """Reads a recording, complete or not."""
     walk = McapScanner(path)
     content = [entry.content for entry in walk.entries()]
     frames, states, samples, events = (
@@ -96,11 +95,9 @@ class Session:
         return until(met, what, 4 * PATIENCE)
 
     def wait_for(self, text: str) -> None:
-        """Waits for a text in its output."""
         self.until(lambda: text in self.output(), f"{text!r} is said")
 
     def code(self, seconds: float = 4 * PATIENCE) -> int:
-        """Waits for its end; returns the exit code."""
         until(self.ended, f"the session ends\n{self.output()}", seconds)
         return int(self._code.read_text())
 
@@ -120,7 +117,6 @@ class Session:
         return read_recorded(self.directory / "session.mcap")
 
     def child(self, word: bytes) -> int:
-        """Process id of its child that has a word in its command line."""
         return child_of(self.pid, word)
 
     def lives(self) -> bool:
@@ -138,7 +134,6 @@ class Session:
             os.kill(self.pid, number)
 
     def send_to_all(self, number: int) -> None:
-        """Sends a signal to all of its processes."""
         with suppress(ProcessLookupError):
             os.killpg(self.pid, number)
 
@@ -158,12 +153,8 @@ class SessionServer:
     def session(
         self, config: dict[str, Any], options: Sequence[str] = (), mapper: float | None = 0.0, **order: Any
     ) -> Iterator[Session]:
-        """A session, started with more options of `live`; its processes end with the block.
-
-        Args:
-            mapper: s that the stub takes for each sample; None: no stub, the mapper itself.
-            order: `rate_check`: whether it checks the head's rate; `environment`: variables.
-        """
+        """A session, started with more options of `live`; its processes end with the block. `mapper`: s that
+        the stub takes for each sample, None for no stub; `order`: see `session_server`."""
         self._count += 1
         folder = self._folder / str(self._count)
         folder.mkdir()

@@ -96,7 +96,6 @@ class Answer:
 
 
 def result_of(number: int, seconds: float) -> Any:
-    """The result of a sample."""
     import numpy as np
 
     from ratslam.live.mapper_process import MappedSample

@@ -34,7 +34,7 @@ from tactile.base.se2 import between, compose, line_distances
 from tactile.frontend import Frontend, TouchConfig
 from tactile.whisker_geometry import ur10_head
 from tests.ratslam.live.test_complete_session import PATIENT, complete_session
-from tests.ratslam.runs.test_map_formats import FILES
+from tests.ratslam.runs.test_saved_map import FILE
 
 WAY = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, np.pi / 2]])
 FREE, HOME, BLOCKING = np.zeros((0, 2)), np.zeros(3), NoWay("no other way")
@@ -288,7 +288,7 @@ def test_goals_off_the_map_are_refused(goal, found):
 
 
 def test_the_arm_begins_where_the_session_of_the_map_ended(tmp_path: Path) -> None:
-    shutil.copy(FILES[-1], tmp_path / "map.npz")
+    shutil.copy(FILE, tmp_path / "map.npz")
     goals = ["live.plan.goal.to=[0]", f"live.plan.goal.map={tmp_path}"]
 
     def path_of(*settings: str) -> list:

@@ -18,7 +18,10 @@ from tactile.base.errors import InputError
 from tests.helpers import tactile_arrays
 from tests.helpers.corridor_camera import Camera, CorridorLoop, write_csv, write_video
 
-FRONT_ENDS = {"taxels": taxel_array.ENTRY, "wrench": tactile_arrays.WRENCH_FRONTEND}
+SENSORS = {
+    "taxels": (tactile_arrays.TAXELS, taxel_array.ENTRY),
+    "wrench": (tactile_arrays.WRENCH, tactile_arrays.WRENCH_FRONTEND),
+}
 SIMULATION = {
     "motion": {"jitter": {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}},
     "maze": {"columns": 3, "rows": 3, "loop": 8}, "path": {"circuits": "CCC"},
@@ -26,16 +29,13 @@ SIMULATION = {
 
 
 @pytest.mark.parametrize("plugin", [pytest.param("taxels", marks=pytest.mark.soak), "wrench"])
-def test_another_touch_sensor_maps_three_circuits(plugin: str, tmp_path: Path) -> None:
-    SOURCES.register(plugin, {"taxels": tactile_arrays.TAXELS, "wrench": tactile_arrays.WRENCH}[plugin])
-    TOUCH.register(plugin, FRONT_ENDS[plugin])
+def test_another_touch_sensor_maps_three_circuits(plugin: str, tmp_path: Path, monkeypatch) -> None:
+    source, frontend = SENSORS[plugin]
+    monkeypatch.setitem(SOURCES.builtin, plugin, source)
+    monkeypatch.setitem(TOUCH.builtin, plugin, frontend)
     source = {"plugin": plugin, "settings": {"simulation": SIMULATION}}
     parts = {"pose_cells": {"cells_xy": 11}, "touch": {"frontend": {"plugin": plugin}}, "source": source}
-    try:
-        metric = run(RunConfig.model_validate(parts), tmp_path / "run")[0].quantities["energy_all"]
-    finally:
-        SOURCES.unregister(plugin)
-        TOUCH.unregister(plugin)
+    metric = run(RunConfig.model_validate(parts), tmp_path / "run")[0].quantities["energy_all"]
     assert metric.value < 0.3 * metric.odometry
 
 

@@ -13,12 +13,11 @@ from evaluation.artifacts.run_reader import read_closure_table, read_closure_vie
 from evaluation.report.run_report import view_records
 from ratslam.cli import main
 from ratslam.runs.map_results import write_report
-from tests.helpers.square_run import copy_square_run
+from tests.helpers.commands import ROOT, copy_square_run
 
 axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="of the extra [dev]")
 playwright = pytest.importorskip("playwright.sync_api", reason="of the extra [dev]")
 
-ROOT = Path(__file__).parents[3]
 CHROMIUM = shutil.which("chromium")
 HOSTILE = "<script>alert(1)</script>"
 DRAWN = "[...document.querySelectorAll('.chart')].every((each) => each.querySelector('.main-svg .legend'))"
@@ -54,8 +53,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def visit(browser: Any, tmp_path: Path) -> Iterator[Callable[..., Any]]:
-    """Writes the report of some runs and opens it, without network. The page says nothing on its console,
-    opens no dialog and asks for nothing besides itself."""
+    """Opens the report of some runs; it logs nothing, opens no dialog and asks for nothing but itself."""
     faults: list[str] = []
 
     def watch(route: Any) -> None:

@@ -1,4 +1,4 @@
-"""Map files: one format for runs and loops; refusals of what is spoilt, no map, or of another sensor."""
+"""Map files: of every format ever written; refusals of what is spoilt, no map, or of another sensor."""
 
 import errno
 import os
@@ -29,7 +29,8 @@ from robot.recordings.recording_config import RecordingConfig
 from robot.sources.source import SourceDescription
 
 TESTS = Path(__file__).parents[2]
-FILE = TESTS / "data" / "maps" / f"{FORMAT}.npz"
+FILES = sorted((TESTS / "data" / "maps").glob("*.npz"))
+FILE = FILES[-1]
 CONFIG = {
     "pose_cells": {"cells_xy": 15, "cells_heading": 12, "cell_size": 0.1},
     "attractor": {"engine": "dense"},
@@ -92,6 +93,25 @@ def test_a_loop_goes_on_from_a_run_and_a_run_from_a_loop(run: ratslam.Result, tm
     assert slam.step(reading).outcome == "ok"
     second = ratslam.run(before.config, tmp_path / "second", resume=tmp_path / "again.npz")
     assert read_map(second.directory).steps == 2 * before.steps
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_map_of_any_format_goes_on(file: Path) -> None:
+    """`tests/data/maps/make_map.py` makes the file of the present one."""
+    assert FORMAT in {one.stem for one in FILES}
+    assert file.stat().st_size < 200_000
+    expected, saved = np.loadtxt(file.with_suffix(".csv"), delimiter=","), read_map(file)
+    engine = "window" if file == FILES[-1] else "dense"  # moved since the first
+    assert (saved.config.pose_cells.cells_xy, saved.config.attractor.engine) == (11, engine)
+    assert saved.sensor.describe() == "whisker head, 18 whiskers; views of 3 x 6 x 1, values in 0..1"
+    slam = ratslam.Slam.load(file)
+    assert slam.steps == saved.steps > 0
+    with open_recording(RecordingConfig(file=TESTS / "golden" / "touch_circuits.mcap")) as recording:
+        readings = [sample.reading for sample in recording]
+    for reading in readings[saved.steps : len(expected)]:
+        slam.step(reading)
+    assert len(slam.map.closures()) > 0
+    np.testing.assert_allclose(slam.trajectory(), expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -230,8 +250,7 @@ KINDS = ("bit", "bytes", "cut", "left out", "type", "shape", "version", "bomb", 
 
 
 def spoilt(kind: str, stream: np.random.Generator) -> bytes:
-    """A spoilt copy: bits are wrong, a part of the file or an array is lost or another one, or the file says
-    that it holds more than any memory. Bits that NumPy does not read, such as times, change nothing."""
+    """A spoilt copy; bits that NumPy does not read, such as times, change nothing."""
     whole, arrays = bytearray(content()[0]), dict(content()[1])
     names = [name for name in sorted(arrays) if not name.startswith("frontend/")]
     name = names[stream.integers(len(names))]

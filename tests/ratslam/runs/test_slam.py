@@ -17,8 +17,8 @@ from ratslam.runs.build_session import open_observations
 from ratslam.runs.estimate import PoseEstimate
 from robot.simulation.head.simulated_session import HeadSimulation, SimulationConfig
 from tactile.base.types import MotionKind, Report, Whisk
+from tests.helpers.commands import ROOT
 
-ROOT = Path(__file__).parents[3]
 NO_SOURCE = "backend: classic\npose_cells: {cells_xy: 15, cells_heading: 12}\nattractor: {engine: dense}\n"
 SESSIONS = {
     "a recording": f"""

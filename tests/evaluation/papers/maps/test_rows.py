@@ -33,8 +33,6 @@ def true_pose(made: StoredMap, truth: np.ndarray) -> np.ndarray:
 
 
 class Oracle(Methods):
-    """Knows the truth."""
-
     def localise(self, made: StoredMap, recorded: Recorded) -> Localised:
         """Found after 10 steps at the true pose if images are those of the place, else never."""
         known = "+" not in recorded.log.digest
@@ -69,8 +67,6 @@ class Wrong(Oracle):
 
 
 class Apart(Oracle):
-    """Joins nothing: two pieces."""
-
     def merge(self, maps: Sequence[StoredMap], path: Path) -> StoredMap:
         one, other = maps
         return _stored(path, _joined(one, other.arrays.truth, other.arrays.trajectory, False))

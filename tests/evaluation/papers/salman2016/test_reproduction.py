@@ -25,7 +25,6 @@ from evaluation.studies.metrics import ViewDifferences
 from ratslam.classic import view_templates
 from ratslam.classic.experience_map import ExperienceMap
 from ratslam.classic.view_templates import TemplateConfig
-from ratslam.cli import main
 from ratslam.grid.config import GridConfig
 from ratslam.runs.settings.strict_yaml import parse
 from robot.sources.in_memory import InMemorySource
@@ -33,6 +32,7 @@ from robot.touch_source import observation_of
 from robot.world.arena import Arena
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose
+from tests.helpers.commands import ROOT, refused, said
 from tests.helpers.grid_world import TIPS, create, report
 from tests.helpers.laps import session, square
 
@@ -140,8 +140,7 @@ def test_an_interrupt_keeps_the_finished_sessions(tmp_path, monkeypatch):
     ("fox-fig6", "--set", "create_simulation.arena.sides=2", "side"),
 ])  # fmt: skip
 def test_invalid_arguments_are_refused(tmp_path, capsys, name, option, value, named):
-    assert main(["reproduce", name, "-o", str(tmp_path / "a"), option, value]) == 2
-    assert named in capsys.readouterr().err
+    assert named in refused(capsys, "reproduce", name, "-o", tmp_path / "a", option, value)
     assert not (tmp_path / "a").exists()
 
 
@@ -162,7 +161,6 @@ def test_reproductions_run_to_their_end(name, tmp_path):
     assert (tmp_path / f"{name}.png").exists()
 
 
-ROOT = Path(__file__).parents[4]
 VIEWS = ViewDifferences(np.linspace(0, 1, 11), np.eye(10, dtype=int)[1] * 8, np.ones(10, int), 0.9)
 GRID = (0.01, 0.02, 0.04, 0.08)
 TUNED = """
@@ -205,8 +203,7 @@ def test_the_command_tunes_a_simulated_session(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(threshold_tuning, "THRESHOLDS", GRID)
     config, out = tmp_path / "tiny.yaml", tmp_path / "out"
     config.write_text(TUNED)
-    assert main(["reproduce", "threshold", str(config), "-o", str(out)]) == 0
-    text = capsys.readouterr().out
+    text = said(capsys, "reproduce", "threshold", config, "-o", out)
     assert len([line for line in text.splitlines() if line[:8].strip().startswith("0.")]) >= len(GRID)
     assert "AUC" in text
     assert "templates.threshold=" in text or "no threshold satisfies" in text
@@ -308,8 +305,7 @@ def test_a_tiny_reproduction_leaves_table_rows_and_figure(tmp_path: Path, capsys
     assert len(rows) == 2 * 2 * 3 * len(fox2012.MAPPERS)
     assert set(fox2012.FIELDS) < set(rows[0])
     assert (tmp_path / "fox-fig4.png").read_bytes().startswith(b"\x89PNG")
-    assert main(["reproduce", "fox-fig4", "-o", str(tmp_path)]) == 2
-    assert "exists" in capsys.readouterr().err
+    assert "exists" in refused(capsys, "reproduce", "fox-fig4", "-o", tmp_path)
     reckoned = [{row["odometry_error"] for row in rows if row["set"] == number} for number in "01"]
     assert [len(each) for each in reckoned] == [1, 1]
     assert reckoned[0] != reckoned[1]

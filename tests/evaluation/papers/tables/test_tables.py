@@ -24,10 +24,10 @@ from evaluation.papers.tables.markdown import markdown_header, markdown_row, sel
 from evaluation.papers.trial_sessions import ClosureClaims
 from evaluation.studies import machine
 from evaluation.studies.metrics import TouchMetrics
-from ratslam.cli import main
 from ratslam.mapping.closure_judge import KINDS, WEIGHTS, SequenceEvidence, shipped_weights
 from tactile.base.errors import InputError
 from tests.evaluation.papers.shown import rows_of
+from tests.helpers.commands import refused
 from tests.ratslam.runs.touch_walks import empty_merging_session, simulate_walk
 
 ROWS = ("clean", "main")
@@ -37,7 +37,6 @@ METRICS = TouchMetrics(
     relocalisations=90, closures=100, false_closures=3, experiences=50, steps=200,
 )  # fmt: skip
 TOLD = {"revisits_closed": 0.8, "em_live": 0.04, "em_pieces": 0.008, "unjoined": 0.1, "across": 40}
-ARENA = 0.02, 0.2, np.radians([1.0, 20.0]), 4, [0.9, 0.4, 0.3, 0.04, 0.05]
 
 
 def touched(whisks=(), **changed):
@@ -62,8 +61,7 @@ def test_rows_are_markdown_and_unknown_ones_are_refused_with_a_list(capsys):
     assert markdown_header(["a", "b"]) == "| a | b |\n|---|---|"
     assert select_rows(None, {"a": 1, "b": 2}, ["b"]) == ["b"]
     assert select_rows(["a"], {"a": 1, "b": 2}, ["b"]) == ["a"]
-    assert main(["reproduce", "tables", "touch", "--rows", "mian"]) == 2
-    assert "main; clean" in capsys.readouterr().err
+    assert "main; clean" in refused(capsys, "reproduce", "tables", "touch", "--rows", "mian")
 
 
 CONFIGS = [(lambda row: touch.task_config(touch.TouchTask(row, 31103)), row) for row in touch.ROWS]
@@ -101,7 +99,8 @@ def test_a_touch_row_gives_medians_worst_values_sums_and_kidnaps(monkeypatch):
 
 
 def test_a_grid_row_compares_with_dead_reckoning(monkeypatch):
-    tasks = stub_sessions(monkeypatch, lambda task: ARENA)
+    found = 0.02, 0.2, np.radians([1.0, 20.0]), 4, [0.9, 0.4, 0.3, 0.04, 0.05]
+    tasks = stub_sessions(monkeypatch, lambda task: found)
     _, row = grid.grid_table(["bias"], ["A"], arenas=2, first=7)
     assert tasks == [("A", "bias", 7), ("A", "bias", 8)]
     assert "| 0.200 m | 0.020 | 0.10 | 2, 2 of 2 | 10.5 degrees, 50%, 50% |" in row
@@ -362,11 +361,8 @@ def test_a_folder_that_cannot_be_compared_is_refused(text, said, tmp_path: Path,
     command = ["reproduce", "tables", "touch", "--rows", "clean", "--sessions", "1", "--against"]
     if text is not None:
         (tmp_path / "touch.csv").write_text(text)
-    assert main([*command, str(tmp_path)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert re.search(said, line)
-    assert main([*command, str(tmp_path / "none")]) == 2
-    assert "none: no such folder" in capsys.readouterr().err
+    assert re.search(said, refused(capsys, *command, tmp_path))
+    assert "none: no such folder" in refused(capsys, *command, tmp_path / "none")
 
 
 def test_a_file_of_an_earlier_run_or_of_others_is_not_written_over(tmp_path: Path, monkeypatch) -> None:
@@ -400,7 +396,6 @@ def gap(found, expected) -> float:
 
 @pytest.mark.parametrize("at_once", [False, pytest.param(True, marks=pytest.mark.soak)])
 def test_each_session_of_a_batch_ends_as_by_itself(at_once: bool) -> None:
-    """Sessions of other lengths are refused."""
     recordings = [recorded(seed)[1] for seed in (0, 1, 0)]
     chunks = recordings[0].chunks
     assert sum(chunk[-1] for chunk in chunks) == STEPS

@@ -31,6 +31,7 @@ from tactile.base.se2 import between, compose, integrate, wrap
 from tactile.calibration import calibrate_free
 from tactile.contact_stream import Touch, find_contacts, find_fixed_contacts, start_stream
 from tests.evaluation.papers.shown import table_of
+from tests.helpers.commands import ROOT
 
 MARKED = ("left0", "right0")
 HEADER = "whisker,start_row,end_row,label\n"
@@ -158,12 +159,10 @@ def test_the_simulator_has_the_noise_drift_and_creep_of_the_fitted_whiskers(refe
     assert sum(line.startswith("|") for line in table_of(drift.FIGURE, found, tmp_path)) == 2 + len(free)
 
 
-ROOM = np.array([[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0]], float)
-
-
 def test_a_contact_counts_once_and_true_revisits_are_of_the_same_place_and_heading() -> None:
     position = np.array([[2.0, 1.0], [2.0, 0.2], [2.0, 0.3], [2.0, 1.5], [3.9, 1.5], [5.0, 4.0]])
-    contact = wall_distances(position, np.array([0, 1, 1, 0, 1, 0], bool), ROOM)
+    room = np.array([[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0]], float)
+    contact = wall_distances(position, np.array([0, 1, 1, 0, 1, 0], bool), room)
     np.testing.assert_allclose(contact, [0.2, 0.1])
     # A lap of 30 keyframes driven twice, the second time 0.1 rad to the left.
     angle = 2 * np.pi * np.arange(60) / 30
@@ -208,9 +207,6 @@ def test_nothing_is_left_where_a_recording_is_missing(tmp_path: Path, name: str,
     assert not (tmp_path / "page").exists()
 
 
-SLICE = Path(__file__).parents[3] / "data" / "real_touch" / "purdue"
-
-
 def along(cells, heading=0.0, whisks=6):
     x = (np.repeat(cells, whisks) + 0.5) * CELL_SIDE
     return np.column_stack([x, np.full(len(x), 0.5 * CELL_SIDE), np.full(len(x), heading)])
@@ -242,7 +238,8 @@ def test_rows_come_from_the_half_of_the_visit_never_twice_and_too_few_are_refuse
     assert walk_source.most_needed(visits) == 11
     with pytest.raises(InputError, match="object 0 is felt 11 times"):
         walk_source.draw_by_place(records, visits, seed=0)
-    for folder, named in ((tmp_path, "no CSV files"), (SLICE, "choose another seed")):
+    some = ROOT / "tests" / "data" / "real_touch" / "purdue"
+    for folder, named in ((tmp_path, "no CSV files"), (some, "choose another seed")):
         config = walk_source.WalkConfig(folder=folder, simulation=walk_source.walk_simulation(31200))
         with pytest.raises(InputError, match=named):
             walk_source.open_walk(config)

@@ -23,8 +23,6 @@ from tactile.base.settings import Settings
 
 
 class PoseCells(Settings):
-    """A section."""
-
     excite_sigma: float = Field(1.0, gt=0)
     """Width of the excitation, cells."""
     shape: tuple[int, int, int] = (21, 21, 36)

@@ -173,8 +173,6 @@ def test_an_unstable_digest_is_told_and_a_live_source_is_read_once():
 
 
 class Taxels:
-    """A front end for arrays of 66 taxels."""
-
     view_shape, whiskers = (3, 22, 1), 0
 
     def observe(self, reading):
@@ -324,12 +322,10 @@ def needs_camera(*_):
 
 
 def precise(kind):
-    """The entry of a backend that computes in one precision only."""
     return entry_of(__init__=lambda self, *_: setattr(self, "dtype", np.dtype(kind)))
 
 
 def map_of(kind=PathMap, **methods):
-    """The entry of a backend whose map has other methods."""
     return entry_of(map_class=type("Broken", (kind,), methods))
 
 
@@ -522,7 +518,6 @@ def steps(settings):
 
 @pytest.fixture
 def parts(monkeypatch):
-    """Parts of each kind, registered for one test."""
     images = TouchEntry(NoSettings, lambda settings, info: Frontend(TouchConfig(), info.calibration))
     for registry, name, entry in (
         (BACKENDS, "example", dead_reckoning.ENTRY),

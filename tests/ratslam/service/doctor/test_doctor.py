@@ -23,7 +23,6 @@ from tactile.base.errors import InputError
 from tests.helpers.commands import ROOT, said
 from tests.helpers.corridor_camera import Camera, CorridorLoop, write_csv, write_video
 from tests.helpers.ros_bags import Entry, header, odometry, scan, tf, transform, write_bag
-from tests.helpers.square_run import copy_square_run
 
 START, STEP = 1_700_000_000_000_000_000, 100_000_000  # ns
 STEPS = 40
@@ -209,12 +208,6 @@ def test_a_configuration_like_a_map_of_another_sensor_is_a_fault(folder, written
 
 
 # Of a run
-
-
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
-    """A finished run that a test may spoil."""
-    return copy_square_run(tmp_path / "run")
 
 
 def test_a_good_map_is_believed_and_the_doubt_in_its_health_decides(run: Path, capsys) -> None:

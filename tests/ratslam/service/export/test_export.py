@@ -22,9 +22,8 @@ from evaluation.metrics.trajectory import align, read_tum, write_tum
 from ratslam.service.export_formats import export_run
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, wrap
-from tests.helpers.commands import ROOT
+from tests.helpers.commands import ROOT, copy_square_run
 from tests.helpers.g2o import read_g2o
-from tests.helpers.square_run import copy_square_run
 
 FRAMES = [("map", "odom"), ("odom", "base_link")]
 GRID = OccupancyGrid(np.array([[0.0, 0.3, 1.0], [0.1, 0.5, 0.7]]), np.array([-1.25, 0.5]), 0.05)
@@ -57,7 +56,6 @@ def messages(path):
 
 @pytest.fixture(scope="module")
 def exported(square, tmp_path_factory):
-    """The run as an MCAP file, and its messages."""
     path = tmp_path_factory.mktemp("mcap") / "square.mcap"
     export_run(square, path)
     return path, messages(path)

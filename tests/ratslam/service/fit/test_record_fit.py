@@ -31,7 +31,6 @@ def value(rig: Rig, name: str) -> float:
 
 
 def fitted(folder: Path, text: str) -> Rig:
-    """What a record tells by this configuration."""
     (folder / "config.yaml").write_text(text)
     return fit_record(load_config(folder / "config.yaml"))
 
@@ -53,7 +52,6 @@ def test_wheels_are_measured_and_the_file_is_included(tmp_path: Path, capsys) ->
     write_csv(tmp_path / "drive_truth.csv", t=time, x=x, y=y, heading=heading)
     rig = tmp_path / "rig.yaml"
     lines = said(capsys, "fit", tmp_path / "drive_odometry.csv", "-o", rig).splitlines()
-    assert lines[0].split() == ["quantity", "assumed", "now", "+-", "unit", "setting"]
     row = next(line.split() for line in lines if line.startswith("turn scale"))
     assert (row[2], row[-1]) == ("1", "recording.odometry.turn_scale")
     assert float(row[3]) == pytest.approx(1.1, abs=0.02)
@@ -74,7 +72,6 @@ def test_settings_are_those_that_differ() -> None:
     unsure = Quantity("b", 1.0, 1.1, 0.1, "", "recording.odometry.length_scale")
     rig = Rig((sure, unsure, Quantity("c", None, 3.0, 0.1, "")), head)
     assert rig.included() == {"recording": {"odometry": {"turn_scale": 1.1}}} | head
-    assert "turn_scale: 1.1" in rig.file_text("a.csv")
     assert "nothing to include" in Rig().file_text("a.csv")
 
 
@@ -208,8 +205,7 @@ def assert_near(found: tuple[float, float] | None, value: float) -> None:
 
 
 def test_systematic_errors_and_noise_are_found() -> None:
-    """Those of one half help the other; noises, and standard deviations by a bootstrap, follow from the
-    seed."""
+    """Those of one half help the other; noises and bootstrapped deviations follow from the seed."""
     time, motion, truth = drive(0)
     found = fit_wheels(time, motion, truth)
     for pair, value in ((found.length_scale, LENGTH), (found.turn_scale, TURN), (found.heading_bias, BIAS)):

@@ -310,7 +310,6 @@ NETWORK = NetworkConfig(cells_xy=7, cells_heading=8)
 
 @pytest.fixture(scope="module")
 def pynwb():
-    """The package, which takes seconds to import."""
     return importlib.import_module("pynwb")
 
 
@@ -325,7 +324,6 @@ def three():
 
 @pytest.fixture
 def run(three, tmp_path):
-    """A run directory with what an export of spikes reads."""
     directory = tmp_path / "run"
     directory.mkdir()
     (directory / "config.yaml").write_text(RUN_CONFIG)

@@ -25,7 +25,6 @@ from tactile.base.types import Odometry, observation
 from tactile.whisker_geometry import HeadConfig, shaft_points, ur10_head
 from tests.helpers.commands import SQUARE, contents
 from tests.helpers.live import until
-from tests.helpers.square_run import copy_square_run
 
 HEAD = ur10_head(HeadConfig(dead=(7,)))
 WHISKERS = len(HEAD.length)
@@ -51,22 +50,16 @@ class Shown:
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory):
-    """A run without a view."""
-    return copy_square_run(tmp_path_factory.mktemp("plain") / "run")
-
-
-@pytest.fixture(scope="module")
 def viewed(tmp_path_factory):
-    """The same run with a view in a file: the run directory and what the file shows."""
+    """The run of `square` with a view in a file: the run directory and what the file shows."""
     folder = tmp_path_factory.mktemp("shown")
     assert main(["run", SQUARE, "-o", str(folder / "run"), "--rerun", str(folder / "view.rrd")]) == 0
     return folder / "run", Shown(folder / "view.rrd")
 
 
-def test_a_view_in_a_file_changes_no_result_and_shows_every_step(plain, viewed):
+def test_a_view_in_a_file_changes_no_result_and_shows_every_step(square, viewed):
     directory, shown = viewed
-    assert contents(plain, "timing.csv") == contents(directory, "timing.csv")
+    assert contents(square, "timing.csv") == contents(directory, "timing.csv")
     done = read_run(directory)
     steps, last = len(done.time), len(done.time) - 1
     places = shown("/world/robot", "Transform3D:translation")
@@ -207,7 +200,7 @@ def one_warning(capfd):
 
 
 @pytest.mark.soak
-def test_a_viewer_killed_in_the_middle_changes_no_result(plain, tmp_path, capfd):
+def test_a_viewer_killed_in_the_middle_changes_no_result(square, tmp_path, capfd):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
@@ -229,23 +222,20 @@ def test_a_viewer_killed_in_the_middle_changes_no_result(plain, tmp_path, capfd)
         finally:
             if server.poll() is None:
                 kill(None)
-    assert contents(plain, "timing.csv") == contents(tmp_path / "run", "timing.csv")
+    assert contents(square, "timing.csv") == contents(tmp_path / "run", "timing.csv")
     assert f"127.0.0.1:{port} is gone" in one_warning(capfd)
 
 
 @pytest.mark.soak
-def test_a_viewer_that_accepts_and_never_reads_changes_no_result(plain, tmp_path, capfd):
+def test_a_viewer_that_accepts_and_never_reads_changes_no_result(square, tmp_path, capfd):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen()  # the kernel accepts
         address = f"127.0.0.1:{listener.getsockname()[1]}"
         with Viewer(prepare_target(address), end=1.0) as viewer:
             run(load_config(SQUARE), tmp_path / "run", observers=[viewer])
-    assert contents(plain, "timing.csv") == contents(tmp_path / "run", "timing.csv")
+    assert contents(square, "timing.csv") == contents(tmp_path / "run", "timing.csv")
     assert f"the view at {address} did not keep up" in one_warning(capfd)
-
-
-ENDS = "ended early; the results are complete"
 
 
 @pytest.mark.parametrize(
@@ -253,7 +243,7 @@ ENDS = "ended early; the results are complete"
     [
         ("import time; time.sleep(1000)", 0.1, 1000, range(701, 1001), "messages were dropped"),
         ("raise SystemExit(1)", 10.0, 100, range(101), "ended early"),
-        ("import sys; sys.stdin.buffer.read(); raise SystemExit(1)", 10.0, 1, range(1), ENDS),
+        ("import sys; sys.stdin.buffer.read(); raise SystemExit(1)", 10.0, 1, range(1), "ended early"),
     ],
     ids=["takes nothing", "fails at once", "fails at the end"],
 )
