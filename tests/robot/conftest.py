@@ -6,24 +6,6 @@ import pytest
 from tactile.base.errors import InputError
 
 
-<<<<<<< HEAD
-@pytest.fixture(scope="session")
-def find_trace(golden, request):
-    """Finds the path of a reference trace, in the project's golden files or among the recordings."""
-
-    def find(name):
-        own = golden / f"{name}.npz"
-        return own if own.is_file() else request.getfixturevalue("reference_data") / "traces" / own.name
-
-    return find
-=======
-@pytest.fixture(params=SYNTHETIC)
-def trace(request: pytest.FixtureRequest, find_trace: Callable[[str], Path]) -> Path:
-    """Each synthetic reference trace."""
-    return find_trace(request.param)
->>>>>>> 392b16eae405848d190002f8c762a8311f2a8640
-
-
 @pytest.fixture
 def stream(tmp_path):
     """Writes a small valid reference trace, with some arrays replaced (None: omitted)."""
