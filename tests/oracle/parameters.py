@@ -21,12 +21,8 @@ OURS = ("pc_w_", "pc_global", "pc_vt", "vt_active")
 
 
 def settings_of(params, labels):
-    """The configuration of a reference stream's parameters.
-
-    Args:
-        params: names and values of OpenRatSLAM's [ratslam] section; missing ones take its defaults.
-        labels: whether the stream gives template ids instead of views.
-    """
+    """The configuration of a reference stream of these parameters of OpenRatSLAM's [ratslam] section, with
+    its defaults for missing ones, whose views are template ids if it has `labels`."""
     values = Parameters.from_strings(params)._asdict()
     values["vt_panoramic"] = bool(values["vt_panoramic"])
     ours = {theirs for theirs in values if theirs.startswith(OURS)} - params.keys()

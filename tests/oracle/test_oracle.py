@@ -44,9 +44,6 @@ def rings_of(trace):
     return p.pc_dim_xy, p.pc_dim_xy, p.pc_dim_th
 
 
-# The stock engine, step by step; the first difference ends the comparison
-
-
 def follow(trace, steps=None):
     """Asserts that the stock engine makes (the first `steps` of) a trace."""
     engine = StockEngine(trace.parameters)
@@ -95,7 +92,6 @@ def compare_row(trace, engine, step, index, row):
 
 
 def compare_cells(trace, engine, name):
-    """The whole network."""
     expected = np.zeros_like(engine.cells.activity)
     expected[tuple(trace.arrays[f"cells_{name}_idx_kyx"].T.astype(int))] = trace.arrays[f"cells_{name}_val"]
     assert_close(engine.cells.activity, expected, ACTIVITY, name)
@@ -110,7 +106,6 @@ def compare_table(ours, theirs, exact, rings):
 
 
 def compare_nodes(trace, engine, name):
-    """The nodes of the map and the experiences behind them."""
     graph, (n, _, headings) = engine.map, rings_of(trace)
     nodes = [
         (e, graph.x[e], graph.y[e], graph.th[e], *place.packet, place.template)
@@ -129,14 +124,11 @@ def test_the_stock_engine_makes_a_real_trace(steps):
     follow(real(INTEL), steps)
 
 
-# The JAX engine beside the plain one
-
 PACKET = 1e-12
 BOUND_STEPS = 1000  # rounding grows along a stream; beyond this many steps only decisions are compared
 
 
 def observed(observation):
-    """The observation as input of the plain engine."""
     motion = tuple(map(float, observation.odometry[:3]))
     view = np.asarray(observation.view, float)[:, :, 0] if observation.view_seen else None
     return Input(motion, view, int(observation.label) if observation.label >= 0 else None)

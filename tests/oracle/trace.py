@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections import namedtuple
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,15 +47,8 @@ class Parameters(NamedTuple):
         return cls(**{name: kinds[name](str(text)) for name, text in strings.items() if name in kinds})
 
 
-class Row(NamedTuple):
-    """One row of the input. `label` is a given template and its turn; both None: no view."""
-
-    stamp: float
-    v: float
-    w: float
-    odometry: bool
-    view: Array | None
-    label: tuple[int, float] | None
+Row = namedtuple("Row", "stamp v w odometry view label")
+"""One row of the input. `label` is a given template and its turn; `view` and `label` None: no view."""
 
 
 class Trace:

@@ -1,6 +1,6 @@
 """Laws of the classic map: places, the experience map and its relaxation; laws of view matching."""
 
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -22,16 +22,10 @@ from tests.oracle.stock import Link, StockMap
 from tests.oracle.trace import Parameters
 
 
-class Evidence(NamedTuple):
-    """The fields of `ClassicEvidence` that the map reads."""
-
-    template: int = 0
-    relative: float = 0.0
-
-
 def fold(world: ExperienceMap, moved, action=Action.NONE, place=-1, relative=0.0, dt=1.0):
     estimate = Estimate(np.zeros(3), np.zeros(3), place, -1, action, False)
-    world.update(observation(Odometry(*moved, dt)), estimate, Evidence(place, relative))
+    evidence = SimpleNamespace(template=place, relative=relative)
+    world.update(observation(Odometry(*moved, dt)), estimate, evidence)
     return world.pose(estimate)
 
 
@@ -234,6 +228,18 @@ def test_labels_of_any_number_find_their_template():
     store = filled(config, [np.zeros(0)] * 3)
     assert int(view_templates.match_label(store, jnp.int32(102)).template) == 2
     assert int(view_templates.match_label(store, jnp.int32(7)).template) == -1
+
+
+def test_energy_falls_during_a_view_and_recovers_later():
+    config, energies = TemplateConfig(recent=0), []
+    store = filled(config, [np.zeros(SHAPE), np.ones(SHAPE)])
+    for k in [0] * 30 + [1] * 60 + [0]:
+        match = view_templates.Match(jnp.int32(k), jnp.asarray(0.0), jnp.asarray(0.0))
+        store, energy = view_templates.recall(config, store, match, YES)
+        energies.append(float(energy) / config.energy)
+    expected = [(30 - np.exp(1.2 * habituation)) / 30 for habituation in (1, 2, 1)]
+    assert [energies[k] for k in (0, 1, -1)] == pytest.approx(expected)
+    assert energies[29] == 0
 
 
 def test_a_full_store_keeps_its_templates():

@@ -305,9 +305,7 @@ def random_activity(levels, number):
     return Activity(tuple(blocks), jnp.int32(number))
 
 
-@pytest.mark.parametrize(
-    ("levels", "number"), [*((LEVELS, number) for number in range(len(LEVELS))), (DENSE, 0)]
-)
+@pytest.mark.parametrize(("levels", "number"), [*((LEVELS, k) for k in range(4)), (DENSE, 0)])
 def test_chosen_and_all_cells_and_sums_are_those_of_the_torus(levels, number):
     activity = random_activity(levels, number)
     full = np.asarray(to_full_torus(levels, activity))
@@ -342,14 +340,9 @@ def test_cells_are_drawn_by_the_seed_without_repetition_and_given_ones_keep_thei
 
 
 @pytest.mark.parametrize(
-    ("chosen", "message"),
-    [
-        (45 * 45 * 72 + 1, r"cells.chosen: 145801; expected at most 145800"),
-        (((0, 0, 0), (45, 0, 0)), r"cells.chosen.1: \[45, 0, 0\]"),
-        (((0, 45, 0),), r"cells.chosen.0: \[0, 45, 0\]"),
-        (((0, 0, 72),), r"cells.chosen.0: \[0, 0, 72\]; expected x and y below 45, heading below 72"),
-    ],
+    ("chosen", "where"),
+    [(145_801, ""), (((0, 0, 0), (45, 0, 0)), ".1"), (((0, 45, 0),), ".0"), (((0, 0, 72),), ".0")],
 )
-def test_cells_outside_the_network_are_refused(chosen, message):
-    with pytest.raises(InputError, match=message):
+def test_cells_outside_the_network_are_refused(chosen, where):
+    with pytest.raises(InputError, match=rf"cells\.chosen{where}: .*expected"):
         choose_cells(chosen, TORUS, 0)

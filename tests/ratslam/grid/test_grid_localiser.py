@@ -1,7 +1,7 @@
 """A session in a finished grid map: its surfaces, what whiskers would meet there, and its states."""
 
 import csv
-from typing import NamedTuple
+from collections import namedtuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -102,14 +102,8 @@ BLANK = Estimate(*(np.float32(0) for _ in Estimate._fields))._replace(pose=np.ze
 SEARCHING, FOUND, LOST, NOT_THIS_MAP = Localisation
 
 
-class Planted(NamedTuple):
-    share: float
-    log_odds: float
-    failed: bool = False
-    pose: np.ndarray = np.array([0.1, 0.2, 0.3])
-    covariance: np.ndarray = np.diag([1e-4, 4e-4, 1e-2])
-
-
+REST = False, np.array([0.1, 0.2, 0.3]), np.diag([1e-4, 4e-4, 1e-2])
+Planted = namedtuple("Planted", "share log_odds failed pose covariance", defaults=REST)
 SURE, TORN, WEAK, FAILED = Planted(1.0, 11.0), Planted(0.9, 11.0), Planted(1.0, 4.0), Planted(1.0, -6.0, True)
 
 

@@ -102,4 +102,4 @@ def slopes(function, x, h=1e-6):
 def apart(a, b):
     gap = a - b
     gap[:, 2] = wrap(gap[:, 2])
-    return np.abs(gap).max()
+    return np.abs(gap).max(initial=0.0)

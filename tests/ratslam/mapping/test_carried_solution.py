@@ -60,7 +60,6 @@ def test_every_view_is_compared_with_all_but_those_of_nearly_the_same_time():
 
 @pytest.mark.parametrize("told", [FIT, 0.0])
 def test_odds_are_as_large_as_the_views_tell(told):
-    """Views that fit at their places and not elsewhere tell much; views that are alike everywhere nothing."""
     fits = np.where(np.isfinite(SESSION.fits), np.sign(SESSION.fits) * told, -np.inf)
     odds = carried_solution.learn_odds(SESSION._replace(fits=fits.astype(np.float32)))
     assert (odds.of(told) - odds.of(-told) > 2) == (told > 0)

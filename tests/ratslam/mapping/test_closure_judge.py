@@ -77,17 +77,11 @@ def judged():
     return graph, found.log
 
 
-def cuts(graph, *frames):
-    """Breaks of the odometry before keyframes."""
-    cut = GrowableArray((), np.int64)
-    cut.replace(np.full(graph.count, -1))
-    cut.rows[list(frames)] = 0
-    return cut
-
-
 def evidence(graph, log, sequences, cut=(), after=closure_judge.BEYOND):
     """The evidence on sequences where the odometry breaks before keyframes `cut`."""
-    found = at_fit(graph, solution(graph, log).fit(), log, cuts(graph, *cut))
+    breaks = GrowableArray((), np.int64)
+    breaks.replace(np.where(np.isin(np.arange(graph.count), cut), 0, -1))
+    found = at_fit(graph, solution(graph, log).fit(), log, breaks)
     return closure_judge.sequence_evidence(found, sequences, after)
 
 
@@ -114,9 +108,7 @@ def test_views_count_up_to_a_break_and_no_further_than_the_keyframes_known(graph
     assert np.all((ended <= cut) & (cut < whole))
 
 
-def test_judging_changes_nothing_and_says_nothing_of_views_without_weights_or_carried_robots(
-    judged,
-):
+def test_judging_changes_nothing_and_is_silent_on_views_without_weights_or_carried_robots(judged):
     graph, log = judged
     before = {**graph.arrays(), **log.arrays()}
     first, again = (judged_odds(graph, log, EVERY) for _ in range(2))

@@ -23,7 +23,8 @@ def scattered(seed: int, count: int = 40) -> Ground:
 @given(SEEDS, POSES)
 def test_near_keyframes_claim_poses_within_reach_and_no_others_do(seed: int, change: np.ndarray) -> None:
     """Wherever the map lies."""
-    ground, moved = scattered(seed), cases.moved_by(change, scattered(seed))
+    ground = scattered(seed)
+    moved = ground._replace(poses=compose(change, ground.poses))
     near = np.zeros((2, len(ground.poses)), bool)
     near[moved.near(change, REACH, cases.REACH_HEADING)] = True
     for shift, found in enumerate(near):
@@ -132,10 +133,8 @@ def test_many_poses_advance_as_each_alone(poses: list, path: list[Motion], seed:
 
 @given(POSES, POSES, PATHS, SEEDS)
 def test_a_rigid_motion_of_the_whole_map_moves_the_result(change, pose, path, seed):
-    frames, stream = (
-        compose(pose, np.random.default_rng(seed).normal(0, 0.1, (20, 3))),
-        np.random.default_rng(1),
-    )
+    frames = compose(pose, np.random.default_rng(seed).normal(0, 0.1, (20, 3)))
+    stream = np.random.default_rng(1)
     one, other = supposed(pose), supposed(compose(change, pose))
     for moved in path:
         gains = stream.normal(1, 2, (1, 20))

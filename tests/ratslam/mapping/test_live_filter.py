@@ -172,12 +172,8 @@ def test_the_map_follows_an_accepted_sequence_until_corrections_that_add_up_lead
     assert ahead(strays, 1000, 0.1)[1] > ahead(strays, 1000)[1]
 
 
-STEP_MOTION = np.array([0.2, 0.05, 0.3])
+STEP_MOTION, NONE = np.array([0.2, 0.05, 0.3]), np.zeros(0)
 POSES = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5], [50.0, 9.0, -2.0]])
-
-
-def fit_at(poses: np.ndarray) -> MapFit:
-    return MapFit(poses, 0.0, np.zeros(0))
 
 
 def travelled(steps: int) -> Travel:
@@ -203,7 +199,7 @@ def recorded_steps(taken: bool = True) -> StepRecord:
 
 def test_steps_before_the_first_keyframe_of_a_piece_lead_to_it_and_remain_with_it() -> None:
     steps = recorded_steps()
-    found = steps.poses(fit_at(POSES))
+    found = steps.poses(MapFit(POSES, 0.0, NONE))
     np.testing.assert_allclose(found[6], POSES[2])
     for k in (4, 5):
         np.testing.assert_allclose(compose(found[k], STEP_MOTION), found[k + 1], atol=1e-12)
@@ -214,7 +210,7 @@ def test_steps_before_the_first_keyframe_of_a_piece_lead_to_it_and_remain_with_i
         number[kept] = np.arange(len(kept))
         remaining = steps.take(number)
         assert remaining.tolist() == np.flatnonzero(np.isin([0, 0, 1, 1, 2, 2, 2], kept)).tolist()
-        np.testing.assert_allclose(steps.poses(fit_at(POSES[kept])), found[remaining])
+        np.testing.assert_allclose(steps.poses(MapFit(POSES[kept], 0.0, NONE)), found[remaining])
 
 
 @pytest.mark.parametrize(("settled", "owner"), [(False, 2), (True, 1)])
@@ -222,7 +218,8 @@ def test_until_it_is_taken_they_belong_to_the_keyframe_before(settled: bool, own
     steps = recorded_steps(taken=False)
     if settled:
         steps.settle(2)
-    np.testing.assert_allclose(steps.poses(fit_at(POSES[:2]))[5], compose(POSES[1], travelled(2).motion))
+    found = steps.poses(MapFit(POSES[:2], 0.0, NONE))[5]
+    np.testing.assert_allclose(found, compose(POSES[1], travelled(2).motion))
     assert steps.of_keyframes(np.array([7, 8])).tolist() == [7, 7, 8, 8, 8, 8]
     steps.arrive(2, travelled(3))
     assert steps.of_keyframes(np.arange(3))[5] == owner

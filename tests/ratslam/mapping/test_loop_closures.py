@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ratslam.mapping.loop_closures import Candidate, ClosureLog, Verdict
+from tests.helpers.merges import random_merge
 
 VARIANCE, SCALES, KEYFRAMES = np.array([0.1, 0.1, 0.02]), (0.5, 2.0, 20.0), 60
 number, odd = st.integers(0, 10), st.floats(-5, 30)
@@ -132,21 +133,13 @@ def random_log(stream, sequences=5):
     return log
 
 
-def random_merge(stream):
-    """Which of `KEYFRAMES` keyframes are gone, the new numbers, and which are merged turned."""
-    gone = stream.random(KEYFRAMES) < 0.5
-    gone[0] = False
-    kept = np.flatnonzero(~gone)
-    onto = np.array([k if not gone[k] else stream.choice(kept[kept < k]) for k in range(KEYFRAMES)])
-    return gone, (np.cumsum(~gone) - 1)[onto], gone & (stream.random(KEYFRAMES) < 0.5)
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_a_merge_keeps_the_evidence_of_every_sequence(seed):
     stream = np.random.default_rng(seed)
     log = random_log(stream)
     whole = log.copy()
-    gone, onto, turned = random_merge(stream)
+    merge = random_merge(stream, KEYFRAMES)
+    gone, onto, turned = ~merge.is_kept(), merge.onto, merge.turned()
     log.accepted_rows()  # remembered, and forgotten by the merge
     log.merge(gone, onto, turned)
     assert np.array_equal(log.sizes(), whole.sizes())
@@ -216,12 +209,8 @@ def test_a_sequence_stands_selections_in_a_row_and_is_confirmed_by_its_weight():
         log.count_selection()
     log.weigh(np.array([0.9, 0.9, 0.4]))
     log.confirm(2)
-    assert log.confirmations().tolist() == [
-        3,
-        2,
-        0,
-        3,
-    ]  # the second has begun to count, the last no longer does
+    # The second has begun to count, the last no longer does.
+    assert log.confirmations().tolist() == [3, 2, 0, 3]
     log.confirm(5)
     assert log.confirmations().tolist() == [5, 5, 0, 3]
 

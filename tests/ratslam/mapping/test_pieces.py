@@ -17,6 +17,7 @@ from ratslam.mapping.optimizer import CalibrationPrior
 from ratslam.mapping.pieces import APART, number_pieces, piece_start, placed_pieces
 from tactile.base.se2 import between, compose, wrap
 from tests.ratslam.mapping.map_cases import BIAS, CELL, LAP, STEP, drive, new_map, sequence, with_log
+from tests.ratslam.mapping.optimizer_cases import apart as poses_apart
 
 
 @st.composite
@@ -64,9 +65,7 @@ def test_pieces_keep_their_shape_and_lie_apart_unless_a_closure_brings_them_to_w
     poses, joints = found
     placed, stretch = placed_pieces(poses, *joints, SMALL), np.cumsum(joints[0])
     first = np.searchsorted(stretch, stretch)  # of the stretch of each keyframe
-    shape = between(placed[first], placed) - between(poses[first], poses)
-    shape[:, 2] = wrap(shape[:, 2])
-    assert np.abs(shape).max() < 1e-9
+    assert poses_apart(between(placed[first], placed), between(poses[first], poses)) < 1e-9
     piece = number_pieces(joints[0], np.column_stack([joints[2], joints[1]]))
     for number in np.unique(piece):
         at = np.flatnonzero(piece == number)[0]
@@ -79,8 +78,7 @@ def test_pieces_keep_their_shape_and_lie_apart_unless_a_closure_brings_them_to_w
     turn = random.uniform(-3, 3, 1)
     placed = placed_pieces(poses, joints[0], i, j, turn, SMALL)
     if stretch[i] != stretch[j]:
-        error = placed[j] - placed[i] - (0.0, 0.0, turn[0])
-        assert np.abs([*error[0, :2], wrap(error[0, 2])]).max() < 1e-9
+        assert poses_apart(placed[j], placed[i] + [0.0, 0.0, turn[0]]) < 1e-9
     # A map without beginnings is left as it is.
     assert placed_pieces(poses, np.zeros(len(poses), bool), none, none, np.zeros(0), SMALL) is poses
 
@@ -184,10 +182,9 @@ def test_the_kernel_is_told_where_the_next_piece_starts():
 RADIUS, HEADING = 1.0, 0.5
 
 
-def walk(*frames, world=None):
+def walk(*frames):
     """Folds frames (x, y, heading, matched, sure); returns experiences, changes and poses."""
-    world = world or Experiences(RADIUS, HEADING)
-    poses = np.array([frame[:3] for frame in frames], float)
+    world, poses = Experiences(RADIUS, HEADING), np.array([frame[:3] for frame in frames], float)
     return world, [world.arrive(poses[: k + 1], k, *frames[k][3:]) for k in range(len(frames))], poses
 
 
@@ -274,8 +271,8 @@ def test_the_graph_follows_from_the_changes(steps, cut):
     stands = np.array([[node["x"], node["y"], node["heading"]] for node in graph.nodes.values()])
     np.testing.assert_allclose(stands, moved[made], rtol=0, atol=1e-12)
     for a, b, way in graph.edges(data=True):
-        gap = compose(stands[a], np.array([way["dx"], way["dy"], way["dtheta"]])) - stands[b]
-        assert np.allclose([*gap[:2], wrap(gap[2])], 0, atol=1e-9)
+        reached = compose(stands[[a]], np.array([way["dx"], way["dy"], way["dtheta"]]))
+        assert poses_apart(reached, stands[[b]]) < 1e-9
 
     half, _, _ = walk(*steps[: cut + 1])
     again, _, _ = walk(at(0), at(9))  # its state before is replaced

@@ -1,7 +1,5 @@
 """Random poses and motions, and a loop of keyframes that all look different."""
 
-from typing import NamedTuple
-
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -27,25 +25,20 @@ def supposed(pose: np.ndarray, deviation: float = 0.02) -> PoseHypothesis:
     return PoseHypothesis(pose, np.diag(np.full(3, deviation**2)))
 
 
-def moved_by(change: np.ndarray, ground: Ground) -> Ground:
-    """The ground after a rigid motion [3] of the whole map."""
-    return ground._replace(poses=compose(change, ground.poses))
-
-
 def assert_same_pose(found: np.ndarray, expected: np.ndarray, tolerance: float = 1e-9) -> None:
     error = np.asarray(found) - expected
     error[..., 2] = wrap(error[..., 2])
     np.testing.assert_allclose(error, 0, atol=tolerance)
 
 
-class Loop(NamedTuple):
-    """A square loop whose places all look different: poses [N, 3] of its keyframes, 0.05 m apart."""
+class Loop:
+    """A square loop whose places all look different, with keyframes 0.05 m apart, 20 along each edge."""
 
-    poses: np.ndarray
-
-    @property
-    def ground(self) -> Ground:
-        return ground_at(self.poses)
+    def __init__(self) -> None:
+        motion = np.array([[0.05, 0.0, 0.0]] * 79)
+        motion[19::20, 2] = np.pi / 2
+        self.poses = np.vstack([np.zeros(3), integrate(motion)])
+        self.ground = ground_at(self.poses)
 
     def drive(self, begin: int, count: int, seed: int) -> np.ndarray:
         """[count, 3] true poses of a robot that drives along the loop, and is a little beside it."""
@@ -60,13 +53,6 @@ class Loop(NamedTuple):
             near = ground.near(pose, 1.5 * REACH, 2 * REACH_HEADING)
             gain[k][near] = stream.normal(2.0, 0.7, len(near[0]))
         return gain.astype(np.float32)
-
-
-def square_loop() -> Loop:
-    """A square with 20 keyframes along each edge."""
-    motion = np.array([[0.05, 0.0, 0.0]] * 79)
-    motion[19::20, 2] = np.pi / 2
-    return Loop(np.vstack([np.zeros(3), integrate(motion)]))
 
 
 def odds_of(true: float = 2.0, false: float = -0.3) -> GainOdds:

@@ -128,10 +128,8 @@ def test_real_objects_are_told_apart():
     folder = Path(__file__).parents[2] / "data" / "real_touch" / "purdue"
     views = np.stack([read_object(path)[0].reshape(-1, 128) for path in sorted(folder.glob("*.csv"))])
     thing = np.repeat(np.arange(len(views)), views.shape[1])
-    images, held = (
-        stored_image(views.reshape(-1, 128), np.ones(128, bool)),
-        np.arange(len(thing)) % 4 == 0,
-    )
+    images = stored_image(views.reshape(-1, 128), np.ones(128, bool))
+    held = np.arange(len(thing)) % 4 == 0
     known, places = images[~held], thing[~held]
     model = learn(known, pairs_of(known, places), apart_of(places))
     parts = project(model, known.T)
