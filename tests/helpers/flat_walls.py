@@ -6,7 +6,7 @@ from tactile.base.types import MotionKind, Odometry, Report, StepEnd
 from tactile.wall_estimation.report_frontend import ReportFrontendConfig
 
 RATE, SPEED, CONTACT = 2000.0, 0.02, 2e-4
-SECONDS = np.arange(4000) / RATE
+TIME = np.arange(4000) / RATE
 FEELERS = ReportFrontendConfig().feelers
 POINTING = np.arctan2(*FEELERS.direction.T[::-1])
 LENGTH = 0.14
@@ -15,8 +15,8 @@ STIFF = 3 * 0.725e-3  # strain a radian and 1/m
 
 
 def wall(angle: float, random: np.random.Generator | None = None, *, first: int | None = None) -> np.ndarray:
-    """[T, W, 2] from first contact on, at a wall of that direction (rad in base_link), which is long enough
-    for the whisker `first` only, or endless."""
+    """[T, W, 2] from first contact on, at a wall of that direction (rad in base_link), which is endless, or
+    long enough for the whisker `first` alone; with noise where a stream is given."""
     normal = np.array([np.sin(angle), -np.cos(angle)])
     beta = angle - POINTING
     nearer, side = np.minimum(beta, np.pi - beta), np.where(beta < np.pi / 2, 1, -1)
@@ -34,7 +34,7 @@ def wall(angle: float, random: np.random.Generator | None = None, *, first: int 
     far = float(room[there & (nearer > 0)].max())
     approach = far - np.linspace(0, 0.05, 5001)
     hit = approach[np.argmax(np.abs(strain(approach)[..., 0]).max(axis=1) > CONTACT)]
-    read = strain(hit - SPEED * np.sin(angle) * SECONDS)
+    read = strain(hit - SPEED * np.sin(angle) * TIME)
     return read if random is None else read + 4e-6 * random.standard_normal(read.shape)
 
 
@@ -48,8 +48,8 @@ def post(whisker: int, along: float) -> np.ndarray:
         return np.where(reach < LENGTH, STIFF * (1 / reach - TAPER) * turn, 0.0)
 
     begun = away[np.argmax(np.abs(strain(away)) > CONTACT)]
-    across = strain(begun - np.outer(SPEED * SECONDS, [1.0, 0.0]))
-    read = np.zeros((len(SECONDS), 4, 2))
+    across = strain(begun - np.outer(SPEED * TIME, [1.0, 0.0]))
+    read = np.zeros((len(TIME), 4, 2))
     read[:, whisker] = np.stack([across, 0.08 * across - 0.05 * np.abs(across)], axis=-1)
     return read
 
@@ -64,16 +64,10 @@ def report(
 ) -> Report:
     """A report; that of FWD2 if it has strain."""
     strain = np.zeros((0, 4, 2)) if strain is None else strain
-    seconds = len(strain) / RATE
-    return Report(
-        odometry or (Odometry(SPEED * seconds, 0.0, 0.0, seconds) if seconds else Odometry(0.025, 0, 0, 0.5)),
-        int(motion),
-        int(moment),
-        np.ones(4, bool),
-        np.isin(np.arange(4), contact),
-        np.arange(len(strain)) / RATE,
-        strain,
-    )
+    seconds, time = len(strain) / RATE, np.arange(len(strain)) / RATE
+    driven = Odometry(SPEED * seconds, 0.0, 0.0, seconds) if seconds else Odometry(0.025, 0, 0, 0.5)
+    touched = np.isin(np.arange(4), contact)
+    return Report(odometry or driven, int(motion), int(moment), np.ones(4, bool), touched, time, strain)
 
 
 def met(strain: np.ndarray, share: float = 0.4) -> tuple[Report, Report]:

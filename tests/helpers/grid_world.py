@@ -64,16 +64,11 @@ def report(
     )
 
 
-@cache
 def filter_of(
-    config: GridConfig, whiskers: int = len(MOUNTS), side: float = 2.5, dtype: Any = np.float64
+    whiskers: int = len(MOUNTS), side: float = 2.5, dtype: Any = np.float64, **parts: Any
 ) -> GridBackend:
-    """The filter of a configuration, built and compiled once."""
-    return GridBackend(config, create(whiskers), side, dtype)
-
-
-def settings(**parts: Any) -> GridConfig:
-    return GridConfig.model_validate({"particles": 30} | parts)
+    """The filter of these parts of a configuration, with few particles by default."""
+    return GridBackend(GridConfig.model_validate({"particles": 30} | parts), create(whiskers), side, dtype)
 
 
 @cache

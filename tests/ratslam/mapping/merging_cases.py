@@ -101,33 +101,29 @@ def off(poses, truth):
     return np.hypot(*(compose(fit_rigid_motion(poses, truth), poses) - truth)[:, :2].T)
 
 
-def drifting(motion, seed):
-    """Motions [N, 3] as odometry measures them: with noise of turns and a bias."""
-    error = np.random.default_rng(seed).normal(0, 0.02, len(motion)) - 0.01 * np.hypot(*motion[:, :2].T)
-    measured = np.column_stack([motion[:, :2], motion[:, 2] + error])
-    return measured * (np.arange(len(motion)) > 0)[:, None]
-
-
 def arcs(*parts):
     """[n, 3] motions along arcs of (steps, turn)."""
     turn = np.concatenate([np.full(steps, whole / steps) for steps, whole in parts])
     return np.stack([STEP * np.cos(turn / 2), STEP * np.sin(turn / 2), turn], axis=1)
 
 
-def laps(lap, count, seed):
-    """`count` laps of motions [n, 3]; most places of the first lap are recalled later, `RUN` in a row."""
+def laps(lap, count):
+    """`count` laps of motions [n, 3], by odometry with noise of turns and a bias; most places of the first
+    lap are recalled later, `RUN` in a row."""
     motion = np.tile(lap, (count, 1))
     truth = np.vstack([np.zeros(3), integrate(motion[:-1])])
     motion = np.vstack([np.zeros(3), motion[:-1]])
     k = np.arange(len(motion))
     place = k % len(lap)
     recalled = np.where((k >= len(lap)) & (place % (RUN + PAUSE) < RUN), place, NONE)
-    return Route(drifting(motion, seed), truth, place, place, recalled, np.full(len(k), RATIO))
+    error = np.random.default_rng(0).normal(0, 0.02, len(k)) - 0.01 * np.hypot(*motion[:, :2].T)
+    measured = motion + np.outer(error * (k > 0), [0.0, 0.0, 1.0])
+    return Route(measured, truth, place, place, recalled, np.full(len(k), RATIO))
 
 
 def circles(count, size):
     """Laps of a circle of `size` keyframes."""
-    return laps(arcs((size, 2 * np.pi)), count, 0)
+    return laps(arcs((size, 2 * np.pi)), count)
 
 
 CORRIDOR, NORTH, SOUTH = 16, 0, 74
@@ -135,13 +131,11 @@ CORRIDOR, NORTH, SOUTH = 16, 0, 74
 
 
 def corridors(count):
-    """Laps through two parallel corridors that look the same, 1.3 m apart, heading east in both.
-
-    In the first lap recall takes the second corridor for the first one, when only odometry speaks against it;
-    later it finds nothing there.
-    """
+    """Laps through two parallel corridors that look the same, 1.3 m apart, heading east in both. In the first
+    lap recall takes the second for the first one, when only odometry speaks against it; later it finds
+    nothing there."""
     turns = [part for steps in (16, 26, 36, 26) for part in ((CORRIDOR, 0.0), (steps, np.pi))]
-    route = laps(arcs(*turns), count, 0)
+    route = laps(arcs(*turns), count)
     place = route.place
     inside = (place >= SOUTH) & (place < SOUTH + CORRIDOR)
     look = np.where(inside, place - SOUTH + NORTH, place)

@@ -142,11 +142,7 @@ def test_a_restored_appearance_continues_as_if_uninterrupted(kind, stop):
     follow(second, range(5))  # and replace the whole state
     second.restore(saved)
     assert follow(second, range(stop, 120)) == estimates[stop:]
-    assert second.arrays().keys() == whole.arrays().keys()
-    for name, rows in whole.arrays().items():
-        assert np.array_equal(rows, second.arrays()[name]), name
-    for one, two in zip(whole.metric(), second.metric(), strict=True):
-        assert np.array_equal(one, two)
+    np.testing.assert_equal([second.arrays(), second.metric()], [whole.arrays(), whole.metric()])
     near, about = np.arange(10), np.arange(0, 10, 2)
     assert misfit(whole, 100, near, about) == misfit(second, 100, near, about)
     assert (whole.metric().likeness.size > 0) == (kind in ("touch", "signed"))
@@ -248,8 +244,7 @@ def test_dead_whiskers_neither_fit_nor_misfit_and_those_without_a_flag_count_as_
     other = views.copy()
     other.reshape(LOG_ODDS_INTERVAL, -1)[:, list(dead)] = stream.random((LOG_ODDS_INTERVAL, 3))
     one, two = (touched(rows, dead=dead) for rows in (views, other))
-    for name, rows in one.arrays().items():
-        assert np.array_equal(rows, two.arrays()[name]), name
+    np.testing.assert_equal(one.arrays(), two.arrays())
     assert (one.arrays()["level"][:, list(dead)] == touch.DEAD).all()
     assert np.array_equal(one.metric().likeness, two.metric().likeness)
     assert misfit(touched(views, dead=range(SIZE)), 5, 6) == pytest.approx(np.log(2))
@@ -289,19 +284,15 @@ def test_near_keyframes_are_older_within_the_radius_and_face_along_one_line(seed
     assert np.array_equal(appearance.near_facing(poses, frames, guard, radius, facing), expected)
 
 
-def surroundings(stream):
-    """A smooth function of the bearing, rad."""
-    wave, phase = stream.normal(0, 1, 8) / 4, stream.uniform(0, 2 * np.pi, 8)
-    return lambda bearing: 0.5 + np.cos(bearing[..., None] * np.arange(1, 9) + phase) @ wave
-
-
 def surveyed(seed, width, count=200, bias=0.0, noise=0.01):
-    """Views [N, 18] over a fan of `width` degrees (negative: clockwise), odometry's turns, and lengths."""
+    """Views [N, 18], smooth functions of the bearing over a fan of `width` degrees (negative: clockwise),
+    odometry's turns, and lengths."""
     stream = np.random.default_rng(seed)
     sector = np.radians(width) / SIZE
-    bearing = (np.arange(SIZE) - (SIZE - 1) / 2) * sector
     turn, length = stream.normal(0, 0.35, count), stream.uniform(0.05, 0.4, count)
-    view = surroundings(stream)(np.cumsum(turn)[:, None] + bearing)
+    wave, phase = stream.normal(0, 1, 8) / 4, stream.uniform(0, 2 * np.pi, 8)
+    bearing = np.cumsum(turn)[:, None] + (np.arange(SIZE) - (SIZE - 1) / 2) * sector
+    view = 0.5 + np.cos(bearing[..., None] * np.arange(1, 9) + phase) @ wave
     view = view + noise * stream.normal(0, 1, view.shape)
     return view, turn - bias * length, length  # the odometry's turn lacks the bias
 

@@ -34,11 +34,8 @@ def driven(laps=5, merge_stood=MERGED["merge_stood"]):
 
 
 def test_the_number_of_keyframes_follows_the_ground():
-    drive, counts, newest = (
-        Drive(ROUTE, **MERGED),
-        [],
-        MERGED["merge_newest"] + MERGED["select_every"] + CHUNK,
-    )
+    drive, counts = Drive(ROUTE, **MERGED), []
+    newest = MERGED["merge_newest"] + MERGED["select_every"] + CHUNK
     for lap in range(1, 7):
         drive.go(lap * LAP)
         assert len(drive.rows) == len(drive.map.feedback().poses)
@@ -112,13 +109,8 @@ def test_a_sequence_can_be_undone_unless_it_is_merged():
 BEGUN, END = 240, 320
 """Keyframes at which the archive's selection begins, and the last ones of the drive; the selection is taken
 up when there are an eighth more."""
-STOPS = {
-    "before any merge": 100,
-    "merge due": 222,
-    "between merges": 230,
-    "selecting": BEGUN + 1,
-    "due": BEGUN + 48,
-}
+STOPS = {"before any merge": 100, "merge due": 222, "between merges": 230}
+STOPS |= {"selecting": BEGUN + 1, "due": BEGUN + 48}
 
 
 @pytest.fixture

@@ -15,51 +15,28 @@ from ratslam.methods.config import GridBackendConfig
 from ratslam.methods.grid import GridOutcome
 from ratslam.methods.method_registry import Sensors, build
 from tactile.base.errors import InputError
-from tactile.base.se2 import wrap
+from tactile.base.se2 import compose, wrap
 from tactile.base.types import MotionKind
-from tests.helpers.grid_world import (
-    BLANK,
-    STEADY,
-    TIPS,
-    at_pose,
-    create,
-    drive,
-    filter_of,
-    initial,
-    report,
-    settings,
-    with_map,
-)
+from tests.helpers.grid_world import BLANK, STEADY, TIPS, at_pose, drive, filter_of, initial, report, with_map
 
-FILTER = filter_of(settings())
+FILTER, SINGLE = filter_of(), filter_of(dtype=np.float32)
 PRINTED = filter_of(
-    settings(
-        likelihood={"model": "literal"},
-        footprint={"wall": "edge"},
-        resampling={"schedule": "always", "scheme": "multinomial"},
-    )
-)
-SINGLE = filter_of(settings(), dtype=np.float32)
+    likelihood={"model": "literal"}, footprint={"wall": "edge"},
+    resampling={"schedule": "always", "scheme": "multinomial"},
+)  # fmt: skip
 CORRIDOR = filter_of(
-    settings(
-        particles=1000, cell=0.1, body=0.0, footprint=BLANK, drift=STEADY | {"step": 0.3},
-        resampling={"length": 0.0, "heading": 0.0, "scale": 0.0},
-        likelihood={"free": 0.3, "contact": 1.0},
-    ),
-    whiskers=2,
-    side=1.6,
+    whiskers=2, side=1.6, particles=1000, cell=0.1, body=0.0, footprint=BLANK, drift=STEADY | {"step": 0.3},
+    resampling={"length": 0.0, "heading": 0.0, "scale": 0.0}, likelihood={"free": 0.3, "contact": 1.0},
 )  # fmt: skip
 ALL = range(4)
 BOTH = pytest.mark.parametrize("backend", [FILTER, SINGLE], ids=["float64", "float32"])
+EACH = pytest.mark.parametrize("backend", [FILTER, SINGLE, PRINTED], ids=["float64", "float32", "printed"])
 
 
 def placed(backend, pose, point):
     """[N, K, 2] points [K, 2] of base_link in cells of the map."""
-    pose, point = np.asarray(pose, float), np.asarray(point, float)
-    c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
-    x = pose[:, :1] + c * point[:, 0] - s * point[:, 1]
-    y = pose[:, 1:2] + s * point[:, 0] + c * point[:, 1]
-    return np.asarray(particles.to_cells(np.stack([x, y], axis=2), backend.config.cell, backend.side))
+    there = compose(np.asarray(pose, float)[:, None], np.pad(np.asarray(point, float), ((0, 0), (0, 1))))
+    return np.asarray(particles.to_cells(there[..., :2], backend.config.cell, backend.side))
 
 
 def evidence_at(backend, state, point, layer=EVIDENCE):
@@ -68,10 +45,10 @@ def evidence_at(backend, state, point, layer=EVIDENCE):
     return np.asarray(particles.interpolate(state.maps, layer, place))
 
 
-def column_of_wall(backend, x, *, before=-3.0, wall=4.0, width=0.1):
+def column_of_wall(backend, x):
     """[S, S] evidence: free before x, a wall there, unexplored behind it, m."""
     at = (np.arange(backend.side) - (backend.side - 1) / 2) * backend.config.cell
-    row = np.where(at < x - width / 2, before, np.where(at < x + width / 2, wall, 0.0))
+    row = np.where(at < x - 0.05, -3.0, np.where(at < x + 0.05, 4.0, 0.0))
     return np.tile(row, (backend.side, 1))
 
 
@@ -84,10 +61,6 @@ def scatter(backend):
     pose = stream.normal(0, [0.1, 0.1, 1.0], state.particles.pose.shape)
     maps = stream.normal(0, 2.0, state.maps[:, EVIDENCE].shape)
     return with_particles(state._replace(maps=state.maps.at[:, EVIDENCE].set(maps)), pose=jnp.asarray(pose))
-
-
-def equal(a, b):
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def finite(tree):
@@ -103,7 +76,7 @@ def checked(backend, start, reports):
 
 
 def test_without_whiskers_and_body_it_is_dead_reckoning_compiled_once():
-    backend = filter_of(settings(body=0.0, drift=STEADY), whiskers=0)
+    backend = filter_of(whiskers=0, body=0.0, drift=STEADY)
     session = Session(backend)
     reports = [report(0.05, 0.0, whiskers=0), report(0.0, 0.4, whiskers=0)] * 150  # past the first capacity
     steps = list(session.replay(reports[:290])) + [session.step(o) for o in reports[290:]]
@@ -129,7 +102,7 @@ def test_seeds_differ_and_repeat():
 def test_more_cells_than_can_be_counted_are_refused():
     config = GridBackendConfig.model_validate({"grid": {"particles": 300_000, "side": 2.5}})
     with pytest.raises(InputError, match="fewer particles"):
-        build("grid", config, Sensors((1, 4, 1), create()))
+        build("grid", config, Sensors((1, 4, 1), FILTER.feelers))
     with pytest.raises(InputError, match="without whiskers"):
         build("grid", config, Sensors((1, 4, 1)))
 
@@ -199,7 +172,7 @@ ODD = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("backend", [FILTER, SINGLE, PRINTED], ids=["float64", "float32", "printed"])
+@EACH
 @pytest.mark.parametrize("odd", ODD)
 def test_values_that_are_not_finite_are_reported_and_ignored(backend, odd):
     start, *_ = drive(backend, initial(backend), [report(0.02)] * 2)
@@ -231,7 +204,7 @@ SAME = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("backend", [FILTER, SINGLE, PRINTED], ids=["float64", "float32", "printed"])
+@EACH
 @pytest.mark.parametrize("case", SAME)
 def test_reports_that_carry_the_same_evidence(backend, case):
     before, one, other = SAME[case]
@@ -241,7 +214,8 @@ def test_reports_that_carry_the_same_evidence(backend, case):
     start = drive(backend, start, before or [report(0.02)])[0]
     (state, _, evidence), (expected, _, weighed) = (drive(backend, start, [given]) for given in (one, other))
     # The contacts of the last report only affect the next one.
-    assert equal(state._replace(touched=0), expected._replace(touched=0))
+    plain, same = state._replace(touched=0), expected._replace(touched=0)
+    jax.tree.map(np.testing.assert_array_equal, plain, same)
     assert np.array_equal(evidence.weights, weighed.weights)
 
 
@@ -332,11 +306,9 @@ def test_particles_whose_map_has_the_walls_direction_weigh_more():
 
 
 def corridor(backend, reports, spread):
-    """Mean and variance of the position after each report along a corridor whose map is given, by an exact
-    histogram filter: a heading of 0, and steps d with a standard deviation of `spread` d.
-
-    Weighs as the filter does, from its likelihoods at each place; [T, 2], m and m2.
-    """
+    """[T, 2] mean and variance, m and m2, of the position after each report along a corridor whose map is
+    given, by an exact histogram filter that weighs as the filter does, from its likelihoods at each place: a
+    heading of 0, and steps d with a standard deviation of `spread` d."""
     config, fine = backend.config, 2e-3
     x = np.arange(-0.3, 1.2, fine)
     pose = np.stack([x, 0 * x, 0 * x], axis=1)

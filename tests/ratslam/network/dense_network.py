@@ -4,8 +4,7 @@ States are the pose cells and novelty; every pose cell goes to the view cells th
 to novelty. Nothing here comes from `ratslam.network` but its records.
 """
 
-from functools import cache, partial
-from typing import NamedTuple
+from collections import namedtuple
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +15,11 @@ from ratslam.network.pose_cells import Belief, ViewCells, anchor, predict
 from tactile.base.se2 import compose, inverse
 
 CELL = 0.125
+anchored, predictor = (jax.jit(function, static_argnums=0) for function in (anchor, predict))
 
 
-class Case(NamedTuple):
-    """A network with sides `shape`, a belief, view cells at poses [S, C, 3], and a motion [3]."""
-
-    network: Network
-    shape: tuple[int, int, int]
-    belief: Belief
-    poses: np.ndarray
-    used: np.ndarray
-    motion: np.ndarray
+Case = namedtuple("Case", "network shape belief poses used motion")
+"""A network with sides `shape`, a belief, view cells at poses [S, C, 3], and a motion [3]."""
 
 
 def network_of(heading=12, xy=11, *, excite=0.5, excite_heading=0.4, miss=0.02, leak=0.003, cell=CELL):
@@ -46,17 +39,7 @@ def held(network, shape, poses, mass, used=None):
     """The belief that view cells at poses [S, C, 3] of mass [S, C] give."""
     mass = jnp.asarray(mass, jnp.float32)
     silent = Belief(jnp.zeros(shape, jnp.float32), jnp.zeros_like(mass))
-    return anchored(network)(silent, cells_at(poses, used), mass)
-
-
-@cache
-def anchored(network):
-    return jax.jit(partial(anchor, network))
-
-
-@cache
-def predictor(network):
-    return jax.jit(partial(predict, network))
+    return anchored(network, silent, cells_at(poses, used), mass)
 
 
 def random_case(seed):

@@ -12,8 +12,9 @@ from ratslam.methods.config import RecallBackendConfig
 from ratslam.methods.recall import RecallBackend
 from ratslam.network import pose_cells
 from ratslam.network.pose_cells import Belief
-from ratslam.recall.memory import MapFeedback, MergedRows
+from ratslam.recall.memory import MapFeedback
 from tactile.base.se2 import compose, inverse
+from tests.helpers.merges import random_merge
 from tests.ratslam.network import dense_network as dense
 from tests.ratslam.network.dense_network import CELL, cells_at, network_of, random_case, tie_matrix
 
@@ -23,7 +24,6 @@ ROUNDING = 5e-6
 tie = jax.jit(pose_cells.tie, static_argnums=(0, 1))
 drive = jax.jit(pose_cells.drive, static_argnums=(0, 1))
 read, integrate_path = jax.jit(pose_cells.read, static_argnums=0), jax.jit(pose_cells.integrate_path)
-excite = jax.jit(pose_cells.excite, static_argnums=0)
 activity_at = jax.jit(pose_cells.activity_at, static_argnums=0)
 
 
@@ -53,24 +53,6 @@ def test_excitation_falls_from_one_at_both_sides_and_ends_within_the_ring(sd, si
     assert weights[half:] == pytest.approx(expected[: half + 1], rel=1e-6)
     assert np.array_equal(weights, weights[::-1])
     assert half == (size - 1) // 2 or expected[half + 1] == 0
-
-
-@given(seeds)
-def test_excitation_is_that_of_cells_on_rings(seed):
-    case, stream = random_case(seed), np.random.default_rng(seed)
-    activity = stream.random(case.shape).astype(np.float32)
-    found = np.asarray(excite(case.network, jnp.asarray(activity)), float)
-    assert found == pytest.approx(dense.excited(case.network, activity.astype(float)), rel=1e-5)
-
-
-@given(seeds)
-def test_prediction_is_the_transition_of_a_hidden_markov_model(seed):
-    case = random_case(seed)
-    cells, motion = cells_at(case.poses, case.used), jnp.asarray(case.motion)
-    found, lost = dense.predictor(case.network)(case.belief, cells, motion)
-    expected, novel = dense.predicted(case)
-    assert np.asarray(found, float) == pytest.approx(expected, abs=ROUNDING)
-    assert float(lost) == pytest.approx(novel, abs=ROUNDING)
 
 
 @given(seeds, st.integers(2, 200))
@@ -110,7 +92,7 @@ def test_a_packet_is_not_blurred_by_any_motion(seed, step):
         moved = integrate_path(there, jnp.asarray(motion))
         found = read(network, moved, belief.activity)
         assert float(found[0, 0]) == pytest.approx(whole or float(rest[0, 0]), abs=1e-4)
-        prior, lost = dense.predictor(network)(belief, there, jnp.asarray(motion))
+        prior, lost = dense.predictor(network, belief, there, jnp.asarray(motion))
         assert float(prior[0, 0]) > 0.9
         assert float(prior[0, 0] + lost) == pytest.approx(1, abs=ROUNDING)
 
@@ -134,29 +116,25 @@ def test_activity_is_read_where_the_preferred_poses_of_cells_have_moved(seed):
     assert np.asarray(found) == pytest.approx(expected[chosen], abs=ROUNDING)
 
 
-def update(case, likelihood, novelty, entered):
-    cells = cells_at(case.poses, case.used)
-    found, lost = dense.predictor(case.network)(case.belief, cells, jnp.asarray(case.motion))
-    fresh = 1 - case.belief.activity.sum()
-    prior, rest = (part.astype(float) for part in (found + entered, fresh + lost - entered.sum()))
-    mass, novel = pose_cells.inhibit(likelihood * prior, novelty * rest)
-    return dense.anchored(case.network)(case.belief, cells, mass), float(novel)
-
-
 @given(seeds)
-def test_the_update_is_that_of_a_hidden_markov_model(seed):
+def test_prediction_and_update_are_those_of_a_hidden_markov_model(seed):
     case, stream = random_case(seed), np.random.default_rng(seed)
+    cells, (prior, lost) = cells_at(case.poses, case.used), dense.predicted(case)
+    found, gone = dense.predictor(case.network, case.belief, cells, jnp.asarray(case.motion))
+    assert np.asarray(found, float) == pytest.approx(prior, abs=ROUNDING)
+    assert float(gone) == pytest.approx(lost, abs=ROUNDING)
     likelihood, novelty = stream.exponential(1, case.used.shape) ** 3, stream.exponential(1)
     fresh = 1 - np.asarray(case.belief.activity, float).sum()
     entered = 0.1 * fresh * case.used / max(case.used.sum(), 1)
-    belief, novel = update(case, likelihood, novelty, jnp.asarray(entered, jnp.float32))
-    prior, lost = dense.predicted(case)
+    rest = (1 - case.belief.activity.sum() + gone).astype(float) - entered.sum()
+    mass, novel = pose_cells.inhibit(likelihood * (found.astype(float) + entered), novelty * rest)
+    belief = dense.anchored(case.network, case.belief, cells, mass)
     joint = likelihood * (prior + entered), novelty * (fresh + lost - entered.sum())
     total = joint[0].sum() + joint[1]
     assert np.asarray(belief.mass) == pytest.approx(joint[0] / total, abs=ROUNDING)
-    assert novel == pytest.approx(joint[1] / total, abs=ROUNDING)
+    assert float(novel) == pytest.approx(joint[1] / total, abs=ROUNDING)
     assert np.asarray(belief.activity) == pytest.approx(dense.driven(case, joint[0] / total), abs=ROUNDING)
-    assert float(belief.activity.sum()) + novel == pytest.approx(1, abs=ROUNDING)
+    assert float(belief.activity.sum()) + float(novel) == pytest.approx(1, abs=ROUNDING)
 
 
 def test_views_that_are_nowhere_likely_leave_no_nan():
@@ -171,7 +149,7 @@ def test_at_the_start_all_is_novelty():
     for leaf, shape in zip(belief, ((12, 11, 11), (3, 5)), strict=True):
         assert (leaf.shape, leaf.dtype) == (shape, np.float32)
         assert not np.asarray(leaf).any()
-    found, lost = dense.predictor(network)(belief, cells_at(np.zeros((3, 5, 3))), jnp.ones(3))
+    found, lost = dense.predictor(network, belief, cells_at(np.zeros((3, 5, 3))), jnp.ones(3))
     assert not np.asarray(found).any()
     assert float(lost) == 0
 
@@ -220,9 +198,9 @@ def test_more_cells_read_the_same_where_no_places_share_one(seed, sides):
     assert silent.activity.shape == (12, sides[1], sides[0])
     assert not np.asarray(silent.activity).any()
     assert np.array_equal(silent.mass, before.mass)
-    after = dense.anchored(network)(silent, cells, silent.mass)
+    after = dense.anchored(network, silent, cells, silent.mass)
     assert float(after.activity.sum()) == pytest.approx(float(before.activity.sum()), abs=1e-6)
-    found = (dense.predictor(network)(belief, cells, motion) for belief in (before, after))
+    found = (dense.predictor(network, belief, cells, motion) for belief in (before, after))
     for one, other in zip(*found, strict=True):
         assert np.asarray(other) == pytest.approx(np.asarray(one), abs=1e-5)
 
@@ -244,23 +222,12 @@ def test_pieces_that_lie_apart_need_no_more_cells_than_the_largest():
     assert sides(PATH * [60, 1, 1])[0] == 8 * 21
 
 
-def merge_of(stream, count):
-    """About half of the keyframes merged with older ones, of which some face the other way."""
-    gone = stream.random(count) < 0.5
-    gone[0] = False
-    kept = np.flatnonzero(~gone)
-    onto = np.array([k if not gone[k] else stream.choice(kept[kept < k]) for k in range(count)])
-    offset = np.where(gone[:, None], stream.normal(0, 0.1, (count, 3)), 0.0)
-    offset[:, 2] += np.pi * (gone & (stream.random(count) < 0.5))
-    return MergedRows(kept, (np.cumsum(~gone) - 1)[onto], offset)
-
-
 @given(seeds)
 def test_mass_goes_to_the_row_and_direction_of_the_merged_keyframe(seed):
     belief, stream = random_case(seed).belief, np.random.default_rng(seed)
     shifts, rows = belief.mass.shape
     count = int(stream.integers(1, rows + 1))
-    merged = merge_of(stream, count)
+    merged = random_merge(stream, count)
     mass = np.array(belief.mass) * (np.arange(rows) < count)
     after = pose_cells.merge_rows(belief._replace(mass=jnp.asarray(mass)), merged.onto, merged.offset)
     expected = np.zeros(mass.shape)
@@ -282,12 +249,12 @@ def test_mass_of_rows_that_are_gone_is_novelty(seed):
     kept = np.zeros(rows, bool)
     kept[: len(left)] = left[:rows]
     assert np.array_equal(after.mass, np.where(kept, case.belief.mass, 0))
-    again = dense.anchored(case.network)(after, cells_at(case.poses, case.used), after.mass)
+    again = dense.anchored(case.network, after, cells_at(case.poses, case.used), after.mass)
     assert float(again.activity.sum()) == pytest.approx(float(after.mass.sum()), abs=1e-6)
 
 
 def test_a_memory_without_view_cells_has_nothing_to_merge():
     network = network_of(12, 11)
     belief = pose_cells.start(network, (1, 0))
-    merged = merge_of(np.random.default_rng(0), 1)
+    merged = random_merge(np.random.default_rng(0), 1)
     assert pose_cells.merge_rows(belief, merged.onto, merged.offset) is belief

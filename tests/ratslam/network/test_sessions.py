@@ -80,12 +80,6 @@ def live():
     return Run(begun(), [1] * len(readings()))
 
 
-def assert_same(one, other):
-    assert one.keys() == other.keys()
-    for name, value in one.items():
-        np.testing.assert_array_equal(value, other[name], err_msg=name)
-
-
 def assert_same_steps(one, other):
     for both in zip(one, other, strict=True):
         first, second = (step._replace(probed=None, seldom=None) for step in both)
@@ -108,7 +102,7 @@ def test_the_network_doubles_on_the_way_and_loops_are_closed():
 def test_live_and_replay_give_the_same_bits(sizes):
     run = Run(begun(), sizes)
     assert_same_steps(run.steps, live().steps)
-    assert_same(run.arrays, live().arrays)
+    np.testing.assert_equal(run.arrays, live().arrays)
     assert run.arrays["sides"].tolist() == [2 * CELLS, 2 * CELLS]
     assert compiled().compilations() == len(set(live().kinds))
 
@@ -119,7 +113,7 @@ def test_a_restored_session_goes_on_with_the_same_bits(stop):
     session.restore(live().stops[stop] if stop else session.arrays())
     assert_same_steps(session.replay(readings()[stop:end]), live().steps[stop:end])
     if stop:
-        assert_same(session.arrays(), live().arrays)
+        np.testing.assert_equal(session.arrays(), live().arrays)
 
 
 CHOSEN = np.random.default_rng(0).choice(36 * CELLS**2, 2000, replace=False)
@@ -138,7 +132,7 @@ def probed():
 def test_a_session_with_a_probe_has_the_same_results_and_chosen_cells_are_read_as_all_cells_are():
     _, steps, arrays = probed()
     assert_same_steps(steps, live().steps[:PROBED])
-    assert_same(arrays, live().stops[PROBED])
+    np.testing.assert_equal(arrays, live().stops[PROBED])
     both = [step for step in steps if step.seldom is not None]
     assert len(both) == len(steps) // 20
     assert sum(step.probed.any() for step in both) > 2

@@ -14,11 +14,12 @@ from ratslam.places import difference as differing
 from ratslam.places.crop import crop_map, keyframes_in_box, keyframes_of_piece, keyframes_of_steps
 from ratslam.places.difference import LEAST, MapContent, difference, keyframe_content, overlap, remembered
 from ratslam.places.union import Bend, renew_experiences, unite
-from tactile.base.se2 import between, compose, correct_heading, wrap
+from tactile.base.se2 import between, compose, correct_heading
 from tests.ratslam.mapping.map_cases import BIAS, CELL, LAP, STEP, TRUE, drive, new_map, sequence
 from tests.ratslam.mapping.merging_cases import Drive, circles
-from tests.ratslam.recall.test_merged_rows import CAPACITY, SIZE, TOUCH, random_memory
-from tests.ratslam.recall.test_merged_rows import COUNT as ROWS
+from tests.ratslam.mapping.optimizer_cases import apart
+from tests.ratslam.recall.test_observation_model import BOTH, CAPACITY, SIZE, random_memory
+from tests.ratslam.recall.test_observation_model import COUNT as ROWS
 
 COUNT, END = 12, LAP + 60
 NAMES = [bytes([k]) for k in range(COUNT)]
@@ -77,9 +78,8 @@ def united():
 def test_each_part_keeps_its_shape_and_closures_lies_apart_and_is_corrected_by_its_own_calibration(united):
     for part, bias in ((slice(END), BIAS), (slice(END, None), -BIAS)):
         one, other = united.trajectory()[part], made(bias).trajectory()
-        error = between(one[0], one) - between(other[0], other)
-        error[:, 2] = wrap(error[:, 2])
-        assert np.abs(error).max() < 0.1 * CELL  # both parts say something of the calibration
+        # Both parts say something of the calibration.
+        assert apart(between(one[0], one), between(other[0], other)) < 0.1 * CELL
     assert np.array_equal(united.pieces(), np.arange(2 * (END)) >= END)
     alone = made().closures()
     assert len(alone)
@@ -250,7 +250,7 @@ def test_the_robot_stays_where_it_was_and_drives_on(joined) -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_the_memory_keeps_the_rows_that_remain_and_belief_in_others_is_novelty_at_once(seed: int) -> None:
     stream = np.random.default_rng(seed)
-    memory, inside = random_memory(np.random.default_rng(seed), TOUCH), np.arange(ROWS) % 3 > 0
+    memory, inside = random_memory(np.random.default_rng(seed), BOTH), np.arange(ROWS) % 3 > 0
     rows = crop_map(drive(new_map(), {}, last=ROWS), new_map(), inside)
     view, count, kept = np.asarray(memory.view).T[:ROWS][inside], int(inside.sum()), np.flatnonzero(inside)
     rows = rows._replace(rows=rows.rows._replace(view=view))

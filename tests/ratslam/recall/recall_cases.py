@@ -1,6 +1,6 @@
 """Memories, beliefs and random cases for recall."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -60,34 +60,23 @@ def anchoring(config, network):
     return jax.jit(lambda memory, held: anchor(network, held, view_cells(config, memory), held.mass))
 
 
-@cache
-def filter_of(config, cell=CELL, shape=ROW):
-    network = network_of(config, cell, shape)
-
-    def look(memory, belief, view):
-        weighed = observation_model.view_likelihood(config, cell, memory, view)
-        return recognise(config, network, memory, belief, memory.corrected_motion(), weighed, config.local)
-
-    return jax.jit(look)
+def recalled(config, memory, belief, weighed, cell=CELL):
+    """The belief after a view of these likelihoods, and the result."""
+    network, motion = network_of(config, cell, belief.activity.shape), memory.corrected_motion()
+    return recognise(config, network, memory, belief, motion, weighed, config.local)
 
 
-@cache
-def compile_label_filter(config):
-    network = network_of(config)
-
-    def read(memory, belief, label):
-        weighed = observation_model.label_likelihood(config, memory, label)
-        motion = memory.corrected_motion()
-        return *recognise(config, network, memory, belief, motion, weighed, config.local), weighed
-
-    return jax.jit(read)
+@partial(jax.jit, static_argnums=(0, 1))
+def look(config, cell, memory, belief, view):
+    weighed = observation_model.view_likelihood(config, cell, memory, view)
+    return recalled(config, memory, belief, weighed, cell)
 
 
 def observe(config, memory, view, belief=None, cell=CELL):
     """The belief after a view, and the result; without a belief all is novelty."""
     belief = holding(config, memory, cell=cell) if belief is None else belief
-    look = filter_of(config, cell, belief.activity.shape)
-    return jax.tree.map(np.asarray, look(memory, belief, jnp.asarray(view, memory.x.dtype)))
+    view = jnp.asarray(view, memory.x.dtype)
+    return jax.tree.map(np.asarray, look(config, cell, memory, belief, view))
 
 
 def spaced(count, cells=4.0, cell=CELL):

@@ -13,7 +13,8 @@ from ratslam.core.session import Session
 from ratslam.methods.config import RecallBackendConfig
 from ratslam.methods.recall import RecallBackend
 from ratslam.network.pose_cells import BASIN
-from ratslam.recall.filter import FACING, SUPPORT, place_of, recognise
+from ratslam.recall import observation_model
+from ratslam.recall.filter import FACING, SUPPORT, place_of
 from ratslam.recall.observation_model import LABEL_TEMPER, LABELS, SAMPLES, ObservationLikelihood, label_gains
 from tactile.base.se2 import compose
 from tactile.base.types import Odometry, observation
@@ -240,15 +241,10 @@ BLANK = ObservationLikelihood(
 """A view that says nothing."""
 
 
-def blind(memory, belief):
-    network = cases.network_of(FLAT)
-    return recognise(FLAT, network, memory, belief, memory.corrected_motion(), BLANK, FLAT.local)
-
-
 def test_odometry_alone_is_never_evidence_and_a_view_without_evidence_changes_no_odds():
     # A straight path driven twice: odometry repeats the first drive exactly, without any views.
     memory = filled(FLAT, np.zeros((40, SIZE)), spaced(40, 0.5), scale=0.1)
-    look = jax.jit(blind)
+    look = jax.jit(lambda memory, belief: cases.recalled(FLAT, memory, belief, BLANK))
     # A view that all frames share is no evidence either.
     same = np.full(SIZE, FLAT.floor * 0.1)
     for sure, seeing in ((0.0, False), (0.3, True), (1.0, False)):
@@ -272,16 +268,23 @@ def test_odometry_alone_is_never_evidence_and_a_view_without_evidence_changes_no
     assert float(after.mass.sum()) + float(found.novelty) == pytest.approx(1, abs=1e-5)
 
 
-def label_likelihood(memory, label, masses=None):
-    read = cases.compile_label_filter(FLAT)
-    return jax.tree.map(np.asarray, read(memory, cases.holding(FLAT, memory, masses), jnp.int32(label)))
+@jax.jit
+def read_label(memory, belief, label):
+    weighed = observation_model.label_likelihood(FLAT, memory, label)
+    return *cases.recalled(FLAT, memory, belief, weighed), weighed
+
+
+def seen(memory, label, masses=None):
+    """Belief, result and likelihoods after an id."""
+    belief = cases.holding(FLAT, memory, masses)
+    return jax.tree.map(np.asarray, read_label(memory, belief, jnp.int32(label)))
 
 
 def test_ids_are_evidence_for_and_against_frames_and_only_known_ones_about_the_maps_pose():
     ids = np.arange(40) // 4
     memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=ids)
     known = len(set(ids.tolist()))
-    same, other, new = (label_likelihood(memory, label, {9: 0.6}) for label in (ids[9], ids[30], 77))
+    same, other, new = (seen(memory, label, {9: 0.6}) for label in (ids[9], ids[30], 77))
     weighing = same[2]
     assert weighing.likelihood.shape == (1, cases.CAPACITY)
     assert set(np.flatnonzero(weighing.likelihood[0] == weighing.likelihood.max())) == {8, 9, 10, 11}
@@ -290,7 +293,7 @@ def test_ids_are_evidence_for_and_against_frames_and_only_known_ones_about_the_m
     assert weighing.likelihood[0, 9] > weighing.novelty > weighing.likelihood[0, 30]
     gains = np.log(weighing.likelihood[0, [9, 30]] / weighing.novelty)
     assert label_gains(known) == pytest.approx(gains)
-    newest = label_likelihood(memory, ids[-1])  # which are never recalled
+    newest = seen(memory, ids[-1])  # which are never recalled
     assert newest[1].match < 40 - GUARD
     assert not newest[0].mass[:, 40 - GUARD :].any()
     for label in (99, 99, -1, 4, 98):
@@ -308,7 +311,7 @@ def test_ids_are_evidence_for_and_against_frames_and_only_known_ones_about_the_m
     # The robot is at frame 20, so the map predicts its id.
     memory = filled(FLAT, np.zeros((40, 0)), spaced(40), labels=np.arange(40))
     memory = memory._replace(pose=jnp.asarray(spaced(40)[20]))
-    answers = {label: label_likelihood(memory, label) for label in (20, 3, 77)}
+    answers = {label: seen(memory, label) for label in (20, 3, 77)}
     assert [bool(weighing.informative) for *_, weighing in answers.values()] == [True, True, False]
     assert [int(found.view_fits) for _, found, _ in answers.values()] == [1, 0, -1]
 

@@ -1,7 +1,8 @@
-"""Laws of recall by whisker images, of their levels, and of their likelihood by slow sums over the pixels."""
+"""Laws of recall by whisker images, of their levels, and of their likelihood by slow sums over the pixels;
+rows of the memory after keyframes were merged or restored."""
 
 import math
-from functools import cache
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +13,12 @@ from hypothesis import strategies as st
 
 from ratslam.recall import whisker_likelihood as touch
 from ratslam.recall.config import RecallConfig, sector_shifts
-from ratslam.recall.filter import place_of, recognise
-from ratslam.recall.memory import MapFeedback, init_memory
+from ratslam.recall.filter import place_of
+from ratslam.recall.memory import MapFeedback, MergedRows, init_memory
 from ratslam.recall.observation_model import STEPS, touch_likelihood
 from tactile.whisker_geometry import HeadConfig, ur10_head
-from tests.ratslam.recall.recall_cases import believing, holding, network_of, spaced
+from tests.helpers.merges import random_merge
+from tests.ratslam.recall.recall_cases import believing, holding, recalled, spaced
 
 CELL, SHAPE, GUARD, CAPACITY, NEW_IMAGE_LOG_ODDS = 0.05, (3, 6, 1), 5, 64, 3.0
 PIXELS = touch.pixel_layout(SHAPE)
@@ -24,6 +26,8 @@ SIZE = len(PIXELS.group)
 BOTH = RecallConfig(sector_fov="whiskers", guard=GUARD)
 AHEAD = BOTH.model_copy(update={"shifts": 0})
 SEEDS, seeds = range(8), st.integers(0, 10_000)
+COUNT, PLACED = 20, ("x", "y", "heading", "cosine", "sine")
+"""Rows of a memory whose keyframes are merged, and those of its arrays that hold their poses."""
 
 
 def images_of(stream, count, touching=0.4, dead=0.0):
@@ -67,35 +71,25 @@ def random_case(seed, config=BOTH):
     return memory, belief, np.where(stream.random(SIZE) < 0.7, near, images_of(stream, 1)[0])
 
 
-@cache
-def compile_likelihood(config):
-    return jax.jit(lambda memory, level: touch_likelihood(config, memory, level, PIXELS))
+@partial(jax.jit, static_argnums=0)
+def likelihoods(config, memory, level):
+    return touch_likelihood(config, memory, level, PIXELS)
 
 
-@cache
-def filter_of(config):
-    network = network_of(config, CELL)
-
-    def observe(memory, belief, level):
-        memory, weighing = touch_likelihood(config, memory, level, PIXELS)
-        motion = memory.corrected_motion()
-        return memory, *recognise(config, network, memory, belief, motion, weighing, config.local)
-
-    return jax.jit(observe)
-
-
-def on_host(function, memory, *belief, level):
-    return jax.tree.map(np.asarray, function(memory, *belief, jnp.asarray(level, jnp.int32)))
+@partial(jax.jit, static_argnums=0)
+def recognised(config, memory, belief, level):
+    memory, weighing = touch_likelihood(config, memory, level, PIXELS)
+    return memory, *recalled(config, memory, belief, weighing, CELL)
 
 
 def weigh(config, memory, level):
-    return on_host(compile_likelihood(config), memory, level=level)
+    return jax.tree.map(np.asarray, likelihoods(config, memory, jnp.asarray(level, jnp.int32)))
 
 
 def observe(config, memory, level, belief=None):
     """The memory and the belief after an image, and the result; without a belief all is novelty."""
     belief = holding(config, memory, cell=CELL) if belief is None else belief
-    return on_host(filter_of(config), memory, belief, level=level)
+    return jax.tree.map(np.asarray, recognised(config, memory, belief, jnp.asarray(level, jnp.int32)))
 
 
 @settings(max_examples=30)
@@ -303,3 +297,66 @@ def test_odds_follow_from_one_distribution(seed, visits):
         mixed = (1 - visits.outliers) * near + visits.outliers * heights[group][:, None]
         assert np.allclose(again[1:, 1:], (1 - visits.vanishes) * mixed, rtol=1e-6)
         assert np.allclose(again[1:, 0], visits.appears * heights[group], rtol=1e-6)
+
+
+def random_memory(stream, config, dtype=np.float64, count=COUNT):
+    """A memory with all of its values random."""
+    empty = init_memory(config, SIZE, CAPACITY, np.dtype(dtype), groups=2)
+    filled = jax.tree.map(lambda x: stream.uniform(0, 1, x.shape).astype(x.dtype), empty)
+    rows = np.arange(CAPACITY) < count
+    return filled._replace(
+        count=np.int32(count), distinct=np.int32(7),
+        view=stream.integers(1, 5, empty.view.shape).astype(empty.view.dtype) * rows,
+        label=np.where(rows, stream.integers(0, 50, CAPACITY), -1).astype(np.int32),
+    )  # fmt: skip
+
+
+def merge_with_views(stream):
+    merged = random_merge(stream, COUNT)
+    count = len(merged.source)
+    return merged._replace(view=stream.integers(1, 5, (count, SIZE)), label=stream.integers(0, 50, count))
+
+
+@pytest.mark.parametrize("config", [BOTH, RecallConfig(sector_fov="auto")])
+@pytest.mark.parametrize("seed", range(3))
+def test_rows_are_those_that_remain(seed, config):
+    stream = np.random.default_rng(seed)
+    memory, merged = random_memory(stream, config), merge_with_views(stream)
+    after, rows = memory.merge_rows(merged), len(merged.source)
+    source = np.append(merged.source, np.full(CAPACITY - rows, COUNT))  # rows from there on are empty
+    expected = {name: getattr(memory, name)[source] * (source < COUNT) for name in PLACED}
+    expected |= {"count": rows, "view": np.pad(merged.view.T, ((0, 0), (0, CAPACITY - rows)))}
+    expected["label"] = np.append(merged.label, np.full(CAPACITY - rows, -1))
+    expected["before"] = memory.before[..., source] * (source < COUNT) if config is BOTH else memory.before
+    for name, was in memory._asdict().items():
+        assert np.array_equal(getattr(after, name), expected.get(name, was)), name
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_shapes_and_dtypes_stay(dtype):
+    stream = np.random.default_rng(0)
+    memory, merged = random_memory(stream, BOTH, dtype), merge_with_views(stream)
+    after = memory.merge_rows(merged)
+    one, other = (jax.tree.map(lambda x: (np.shape(x), x.dtype), each) for each in (after, memory))
+    assert one == other
+    leaves = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(after) if isinstance(leaf, jax.Array)]
+    assert len(set(leaves)) == len(leaves)  # one buffer each, because the session donates them
+
+
+def test_merged_keyframes_can_be_restored_but_no_more_than_the_memory_holds():
+    """Twice as many rows: each former one comes back beside the one that it was merged with."""
+    stream, source = np.random.default_rng(0), np.repeat(np.arange(10), 2)
+    memory, views = random_memory(stream, BOTH, count=10), (stream.integers(1, 5, (20, SIZE)), np.arange(20))
+    after = memory.merge_rows(MergedRows(source, 2 * np.arange(10), np.zeros((10, 3)), *views))
+    assert int(after.count) == 20
+    assert np.array_equal(np.asarray(after.x)[:20], memory.x[source])
+    memory = random_memory(stream, BOTH)
+
+    def rows(count):
+        source = np.minimum(np.arange(count), COUNT - 1)
+        views = np.ones((count, SIZE), int), np.zeros(count, int)
+        return MergedRows(source, np.arange(COUNT), np.zeros((COUNT, 3)), *views)
+
+    assert int(memory.merge_rows(rows(CAPACITY)).count) == CAPACITY
+    with pytest.raises(ValueError, match=f"{CAPACITY + 1} keyframes do not fit into a memory of {CAPACITY}"):
+        memory.merge_rows(rows(CAPACITY + 1))

@@ -129,11 +129,6 @@ def resting(seed=0):
     return 100.0 * np.arange(5)[:, None] + 2 * stream(seed, "free").standard_normal((400, 5, 3))
 
 
-def press(record, whisker, first, last):
-    """Presses a whisker by up to 300 in rows first to last."""
-    record[first:last, whisker, 1] += 300 * np.sin(np.pi * np.linspace(0, 1, last - first))
-
-
 @settings(max_examples=15)
 @given(st.integers(0, 200), st.integers(0, 4), st.integers(60, 200))
 def test_a_resting_record_gives_mean_and_noise_also_when_repaired(seed, whisker, first):
@@ -142,7 +137,7 @@ def test_a_resting_record_gives_mean_and_noise_also_when_repaired(seed, whisker,
     np.testing.assert_allclose(baseline.mean[:, 0], 100.0 * np.arange(5), atol=0.6)
     np.testing.assert_allclose(baseline.noise, 2.0, rtol=0.35)
     pressed = resting(seed)
-    press(pressed, whisker, first, first + 120)
+    pressed[:, whisker, 1] += push(400, first, first + 120, 300)[:, 0]
     baseline = calibrate_free(FREE_REPAIR, pressed)
     assert [*baseline.dirty] == [whisker]
     np.testing.assert_allclose(baseline.mean[whisker], 100 * whisker, atol=2.0)
@@ -151,7 +146,7 @@ def test_a_resting_record_gives_mean_and_noise_also_when_repaired(seed, whisker,
 
 def test_contacts_in_a_resting_record_are_refused_with_whisker_and_reason():
     pressed, moving, still = resting(), resting(), resting()
-    press(pressed, 3, 250, 400)
+    pressed[:, 3, 1] += push(400, 250, 400, 300)[:, 0]
     moving[:, 1] += 300 * np.sin(np.arange(400) / 7)[:, None]
     reason = r"^(?!.*whisker 2).*whisker 3: its standard deviation is [\d.]+ times its noise"
     with pytest.raises(InputError, match=reason):
@@ -244,9 +239,8 @@ def rig(seed=0):
 
 def fitted(signal, contact=(0.0,) * WHISKERS):
     names, seconds = tuple(f"w{k}" for k in range(WHISKERS)), BLOCK / RATE
-    return fit_signals(
-        SignalRecord(signal[:4000], signal, BLOCK, seconds, np.array(contact), names, "counts")
-    )
+    record = SignalRecord(signal[:4000], signal, BLOCK, seconds, np.array(contact), names, "counts")
+    return fit_signals(record)
 
 
 def test_noise_colour_and_drift_are_found_in_any_unit():
@@ -279,8 +273,7 @@ def test_dead_and_dirty_whiskers_are_named_and_the_drift_of_one_in_contact_is_un
 
 
 ASSUMED = HeadConfig()
-DELAY_DEG = np.degrees(0.015)
-"""Dead zone of the simulated sensors, which delays contacts."""
+DELAY_DEG = np.degrees(0.015)  # dead zone of the simulated sensors, which delays contacts
 
 
 def head(rest, factor):
