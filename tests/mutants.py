@@ -21,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -196,17 +197,9 @@ def find(mutant: Mutant, root: Path) -> str:
         listed = copy / "selected.txt"
         listed.write_text("\n".join(tests), encoding="utf-8")
         command = [sys.executable, "-m", "pytest", *options, f"@{listed}"]
-        environment = os.environ | {"PYTHONPATH": str(copy)}
+        run = partial(subprocess.run, cwd=copy, env=os.environ | {"PYTHONPATH": str(copy)}, timeout=TIMEOUT)
         try:
-            done = subprocess.run(
-                command,
-                cwd=copy,
-                env=environment,
-                capture_output=True,
-                text=True,
-                timeout=TIMEOUT,
-                check=False,
-            )
+            done = run(command, capture_output=True, text=True, check=False)
         except subprocess.TimeoutExpired:
             return "timeout"
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
