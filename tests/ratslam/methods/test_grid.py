@@ -17,13 +17,14 @@ from ratslam.methods.method_registry import Sensors, build
 from tactile.base.errors import InputError
 from tactile.base.se2 import compose, wrap
 from tactile.base.types import MotionKind
-from tests.helpers.grid_world import BLANK, STEADY, TIPS, at_pose, drive, filter_of, initial, report, with_map
+from tests.helpers.grid_world import STEADY, TIPS, at_pose, drive, filter_of, initial, report, with_map
 
 FILTER, SINGLE = filter_of(), filter_of(dtype=np.float32)
 PRINTED = filter_of(
     likelihood={"model": "literal"}, footprint={"wall": "edge"},
     resampling={"schedule": "always", "scheme": "multinomial"},
 )  # fmt: skip
+BLANK = {"edge": 0.0, "blob": 0.0, "free": 0.0, "body": 0.0}
 CORRIDOR = filter_of(
     whiskers=2, side=1.6, particles=1000, cell=0.1, body=0.0, footprint=BLANK, drift=STEADY | {"step": 0.3},
     resampling={"length": 0.0, "heading": 0.0, "scale": 0.0}, likelihood={"free": 0.3, "contact": 1.0},
