@@ -109,11 +109,11 @@ def test_live_and_replay_give_the_same_bits(sizes):
 
 @pytest.mark.parametrize("stop", [0, *STOPS])
 def test_a_restored_session_goes_on_with_the_same_bits(stop):
-    session, end = begun(), 40 if stop == 0 else None
-    session.restore(live().stops[stop] if stop else session.arrays())
-    assert_same_steps(session.replay(readings()[stop:end]), live().steps[stop:end])
+    whole, session, end = live(), begun(), 40 if stop == 0 else None
+    session.restore(whole.stops[stop] if stop else session.arrays())
+    assert_same_steps(session.replay(readings()[stop:end]), whole.steps[stop:end])
     if stop:
-        np.testing.assert_equal(session.arrays(), live().arrays)
+        np.testing.assert_equal(session.arrays(), whole.arrays)
 
 
 CHOSEN = np.random.default_rng(0).choice(36 * CELLS**2, 2000, replace=False)
