@@ -16,9 +16,9 @@ ROOMS = [
     if len(list(path.parent.rglob("*.py"))) > 1
 ]
 MOST = {
-    "rooms": 30, "folders": 50, "files": 408, "product lines": 76_600, "code lines": 51_720,
-    "test lines": 45_300, "largest file": 600, "longest function": 80, "public names": 1_841,
-    "all names": 2_940, "records": 300, "short and called once": 55, "unused private names": 0,
+    "rooms": 30, "folders": 50, "files": 408, "product lines": 75_900, "code lines": 51_400,
+    "test lines": 44_000, "largest file": 600, "longest function": 80, "public names": 1_840,
+    "all names": 2_920, "records": 298, "short and called once": 55, "unused private names": 0,
     "twin names": 0, "module circles": 0, "room circles": 0,
 }  # fmt: skip
 """Largest number of each figure of `tests.house_figures`; lowered with every step towards its goals."""
