@@ -25,6 +25,7 @@ def main(folder: Path) -> int:
             place_named_tuples(import_module(found.name))
         place_exports(package)
     place_figures()
+    place_stretch()
     pdoc.render.configure(docformat="google", show_source=False)
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
@@ -56,6 +57,14 @@ def place_figures() -> None:
     from matplotlib.figure import Figure
 
     vars(import_module("evaluation.plots.style")).update(Axes=Axes, Figure=Figure)
+
+
+def place_stretch() -> None:
+    """Declares the settings `from` and `to`, which no class statement does."""
+    from robot.recordings.sanity_checks import StretchConfig
+
+    for name in StretchConfig.model_fields:
+        setattr(StretchConfig, name, None)
 
 
 if __name__ == "__main__":
