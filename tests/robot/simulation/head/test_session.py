@@ -4,6 +4,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from jax import tree
 from pydantic import ValidationError
 
 from robot.recordings.mcap_reader import Recording
@@ -180,13 +181,18 @@ def test_a_low_head_may_move_where_its_whiskers_are_free(tmp_path, refused):
     refused(lambda: simulate(LOW, maze={"share": 1.0}), *words)
 
 
+def in_order(source):
+    """The samples with arrays in row-major order, as those of raw sessions need not be."""
+    return [tree.map(np.ascontiguousarray, sample) for sample in source]
+
+
 @pytest.mark.parametrize(("radial", "raw"), list(product([False, True], repeat=2)))
 def test_a_recorded_session_equals_the_session(radial, raw, tmp_path):
     head = HeadConfig(dead=(2,), rest_deg=70.0)
     session = simulate(head, raw=raw, path={"explore": 6.0 if raw else 60.0})
     assert record_source(session, tmp_path / "a.mcap") == session.length
     again = Recording(tmp_path / "a.mcap")
-    assert bits([*again]) == bits([*session])
+    assert bits(in_order(again)) == bits(in_order(session))
     assert (again.info, again.rate_hz) == (session.info, session.rate_hz)
     assert head_config_of(again.info, HeadConfig()) == head
     assert head_config_of(again.info, HeadConfig(dead=(4,))) == head.model_copy(update={"dead": (4,)})
