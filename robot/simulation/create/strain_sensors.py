@@ -293,6 +293,9 @@ class BodyVibration:
     wheels rumble while they roll."""
 
     def __init__(self, config: ShakeConfig, rate: float, random: np.random.Generator) -> None:
+        from scipy.signal import lfilter  # slow: not in the first block of an emulator
+
+        self._filter = lfilter
         self._config, self._rate, self._random = config, rate, random
         pole = np.exp((-1 / config.decay + 2j * np.pi * config.frequency) / rate)
         a, b = -2 * pole.real, abs(pole) ** 2
@@ -318,10 +321,8 @@ class BodyVibration:
 
     def rumble(self, count: int, rolls: bool = True) -> np.ndarray:
         """The next [T, 2] strains of rumble, which goes on when the wheels no longer roll."""
-        from scipy.signal import lfilter  # slow to import
-
         drive = self._random.standard_normal((count, 2)) * rolls
-        rumble, self._state = lfilter([1.0], self._back, drive, axis=0, zi=self._state)
+        rumble, self._state = self._filter([1.0], self._back, drive, axis=0, zi=self._state)
         return self._config.rumble / self._gain * rumble
 
 
