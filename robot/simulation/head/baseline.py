@@ -57,6 +57,9 @@ class Baseline:
     """
 
     def __init__(self, config: BaselineConfig, noise: float, rate: float, whiskers: int, seed: int) -> None:
+        from scipy.signal import lfilter  # slow: not in the first block of an emulator
+
+        self._filter = lfilter
         self._colours, self._steps = stream(seed, "colour"), stream(seed, "drift")
         self._white, self._coloured = np.sqrt(1 - config.colour), noise * np.sqrt(config.colour)
         self._step = noise * config.drift / np.sqrt(rate)
@@ -69,7 +72,7 @@ class Baseline:
     def colour(self, white: np.ndarray) -> np.ndarray:
         """The noise of the next samples [N, T, W, 2], rad, of which white noise, rad, is a part."""
         kicks = np.sqrt(1 - self._keep**2) * self._colours.standard_normal(white.shape)
-        colour, self._colour = _recur(self._keep, kicks, self._colour)
+        colour, self._colour = self._recur(self._keep, kicks, self._colour)
         return self._white * white + self._coloured * colour
 
     def wander(self, deflection: np.ndarray) -> np.ndarray:
@@ -78,25 +81,22 @@ class Baseline:
         The creep is that of a standard linear solid: it tends to its share of the deflection.
         """
         steps = self._step * self._steps.standard_normal(deflection.shape)
-        drift, self._drift = _recur(1.0, steps, self._drift)
-        creep, self._creep = _recur(self._relax, self._gain * deflection, self._creep)
+        drift, self._drift = self._recur(1.0, steps, self._drift)
+        creep, self._creep = self._recur(self._relax, self._gain * deflection, self._creep)
         return drift + creep
 
+    def _recur(self, keep: float, value: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The recursion y = value + keep * last y over the samples of [N, T, W, 2].
 
-def _recur(keep: float, value: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The recursion y = value + keep * last y over the samples of [N, T, W, 2].
+        Args:
+            before: [1, W, 2] keep * y of the sample before.
 
-    Args:
-        before: [1, W, 2] keep * y of the sample before.
-
-    Returns:
-        y, and `before` of the next samples.
-    """
-    from scipy.signal import lfilter  # slow to import
-
-    flat = value.reshape(-1, *value.shape[2:])
-    found, after = lfilter([1.0], [1.0, -keep], flat, axis=0, zi=before)
-    return found.reshape(value.shape), after
+        Returns:
+            y, and `before` of the next samples.
+        """
+        flat = value.reshape(-1, *value.shape[2:])
+        found, after = self._filter([1.0], [1.0, -keep], flat, axis=0, zi=before)
+        return found.reshape(value.shape), after
 
 
 def make_baseline(
