@@ -1,4 +1,4 @@
-"""The commands live and emulate."""
+"""The commands live, topics and emulate."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, Commands, add_config, prepare_jax, read_config
+from ratslam.cli.doctor import FAULTY
 from ratslam.cli.run import add_rerun, add_run_directory, open_target, run_directory
 from robot.drivers.processes import put_last
 from tactile.base.errors import InputError, tell
+from tactile.base.files import make_new_file, require_new_file
 
 if TYPE_CHECKING:
     from ratslam.runs.settings.run_config import RunConfig
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
     live = commands.add(
-        "live", _live, "map with an arm and its whisker head, or a Create",
+        "live", _live, "map with an arm and its whisker head, a Create, or a robot that publishes topics",
         "live live_create --set live.create.plan.minutes=1", "live",
     )  # fmt: skip
     add_config(live)
@@ -34,8 +36,26 @@ def add_commands(commands: Commands) -> None:
         help="address of the whisker head: usb, usb:VENDOR:PRODUCT[:SERIAL] (hexadecimal ids), or "
         "HOST[:PORT] of an emulator",
     )  # fmt: skip
+    live.add_argument(
+        "--source", metavar="ADDRESS", help="robot that publishes topics, such as ws://robot:8765"
+    )
     live.add_path("--localise", "MAP", "localise in this map instead of making one")
+    live.add_path(
+        "--continue", "MAP",
+        "go on with this map: the session begins a piece of it, joined once its views place it",
+        dest="resume",
+    )  # fmt: skip
     add_rerun(live)
+
+    topics = commands.add(
+        "topics", _topics, "list what a running robot publishes, and write the configuration that maps it",
+        "topics ws://robot:8765 -o robot.yaml", "live",
+    )  # fmt: skip
+    topics.add_argument("address", metavar="ADDRESS", help="Foxglove bridge of the robot: ws://HOST:8765")
+    topics.add_path("-o", "YAML", "write the configuration to a new file, for `live`")
+    topics.add_argument(
+        "--seconds", type=float, default=5.0, metavar="S", help="how long to listen (default 5)"
+    )
 
     emulate = commands.add(
         "emulate", _emulate, "emulate the arm's controller, the head or a Create",
@@ -64,6 +84,8 @@ def _live(arguments: argparse.Namespace) -> int:
     from robot.drivers.outcome import SessionOutcome
 
     config, _ = _read_live_config(arguments, arguments.head)
+    if arguments.localise is not None and arguments.resume is not None:
+        raise InputError("--continue", "given with --localise", "one of them: a map grows or stays as it is")
     if arguments.localise is not None:
         from ratslam.runs.localise import check_assignments, localising
         from ratslam.runs.saved_map import read_map
@@ -73,7 +95,9 @@ def _live(arguments: argparse.Namespace) -> int:
         config = localising(config, saved)
     directory, target = run_directory(arguments), open_target(arguments)
     with catch_interrupt("stopping the robot"), monitor() as start_monitor:
-        ended, card = run_live_session(config, directory, tell, armed=start_monitor, view=target)
+        ended, card = run_live_session(
+            config, directory, tell, armed=start_monitor, view=target, resume=arguments.resume
+        )
     if card is not None:
         print(f"{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
         print(summarise(directory, card, config.backend))
@@ -81,6 +105,25 @@ def _live(arguments: argparse.Namespace) -> int:
     if ended.outcome is SessionOutcome.INTERRUPTED:
         return INTERRUPTED
     return 0 if ended.outcome.planned else INPUT_ERROR
+
+
+def _topics(arguments: argparse.Namespace) -> int:
+    from ratslam.runs.settings.strict_yaml import dump_data
+    from ratslam.service.topics_check import diagnose_topics
+
+    if not 0.5 <= arguments.seconds <= 600:
+        raise InputError("--seconds", f"{arguments.seconds:g}", "0.5 to 600")
+    if arguments.output is not None:
+        require_new_file(arguments.output)
+    diagnosis = diagnose_topics(arguments.address, arguments.seconds)
+    output = arguments.output
+    if output is not None and diagnosis.config:
+        first = f"# Maps {arguments.address}; written by `python -m ratslam topics`.\n"
+        text = first + dump_data(diagnosis.config)
+        make_new_file(output, lambda file: file.write_text(text, encoding="utf-8"))
+        diagnosis = diagnosis._replace(advice=(*diagnosis.advice, f"python -m ratslam live {output}"))
+    print(diagnosis.render())
+    return FAULTY if diagnosis.faults else 0
 
 
 def _emulate(arguments: argparse.Namespace) -> int:
@@ -153,6 +196,8 @@ def _read_live_config(
     """
     if arguments.ur_host:
         arguments.set.append(f"live.arm.host={arguments.ur_host}")
+    if getattr(arguments, "source", None):
+        arguments.set.append(f"live.topics.source={arguments.source}")
     if head_address:
         arguments.set.append(f"live.head.address={head_address}")
     config = read_config(arguments)

@@ -224,7 +224,7 @@ class ArmSession(LiveRobot):
             raise fault
 
     def report(self) -> dict[str, Any]:
-        return {
+        return super().report() | {
             "dropped": self._dropped,
             "missing": self._lost,
             **({} if self._steering is None else {"goals": self._steering.ends}),

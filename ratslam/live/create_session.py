@@ -76,7 +76,7 @@ class CreateSession(LiveRobot):
         run_create_loop(self.rig, mapper, count)
 
     def report(self) -> dict[str, Any]:
-        return {
+        return super().report() | {
             "ends": {end.name.lower(): self._ends[end] for end in StepEnd},
             "alive": self.rig.alive.tolist(),
             "serial": self.rig.robot.counts._asdict(),

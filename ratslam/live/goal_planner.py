@@ -91,7 +91,7 @@ def _keyframe_contacts(made: Map, image: ImageConfig, head: Head) -> tuple[np.nd
 def felt_points(observation: Observation, image: ImageConfig, head: Head) -> np.ndarray:
     """[n, 2] contact points of a whisker image in base_link, m."""
     pixels = observation.view[..., 0].reshape(-1)
-    if len(pixels) != len(head.length) or not observation.view_seen:
+    if not len(pixels) == len(head.length) == len(observation.alive) or not observation.view_seen:
         return np.asarray(observation.point)[observation.contact]
     points, there = image_points(head, pixels, image.tallest)
     return points[there & observation.alive]

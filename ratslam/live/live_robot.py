@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,10 @@ from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live.create_rig import CreateRig
 from robot.live.live_rig import Rig
+from robot.live.selftest import find_devices, start_and_check
+from robot.live.topics_rig import TopicsRig
 from robot.recordings.recording_config import RecordingConfig
+from robot.sources.odometry import UNCORRECTED
 from tactile.calibration import Calibration
 
 RECORDING = "session.mcap"
@@ -26,13 +29,16 @@ class LiveRobot:
     """The part of a session that depends on the robot.
 
     Attributes:
-        rig: its devices. job: of the mapper. unit: name of a reading. total: expected number of readings,
-            None if unknown. count: readings passed on so far.
+        rig: its devices. job: of the mapper, known once the devices are found. unit: name of a reading.
+            total: expected number of readings, None if unknown. count: readings passed on so far.
+            view: target of a live view, or None. resume: map to continue, or None.
     """
 
     unit: str
-    rig: Rig | CreateRig
+    rig: Rig | CreateRig | TopicsRig
     job: MappingJob
+    view: str | None = None
+    resume: Path | None = None
     total: int | None
     count = 0
 
@@ -40,6 +46,16 @@ class LiveRobot:
     def end(self) -> SessionOutcome:
         """The outcome of a session that ends as planned."""
         return SessionOutcome.COMPLETE
+
+    def find(self) -> Iterator[str]:
+        """Finds the devices; see `robot.live.selftest.find_devices`."""
+        assert not isinstance(self.rig, TopicsRig)
+        return find_devices(self.rig)
+
+    def check(self) -> Iterator[str]:
+        """Starts and checks the devices; see `robot.live.selftest.start_and_check`."""
+        assert not isinstance(self.rig, TopicsRig)
+        return start_and_check(self.rig)
 
     def calibrate(self, log: Callable[[str], None]) -> Calibration | None:
         """The head's calibration, if any; the devices are tested."""
@@ -55,7 +71,9 @@ class LiveRobot:
 
     def report(self) -> dict[str, Any]:
         """What it adds to the report of the session, as JSON values."""
-        raise NotImplementedError
+        assert not isinstance(self.rig, TopicsRig)
+        head = self.rig.head
+        return {"head": head.decoder.counts._asdict() | {"stalls": head.stalls}}
 
 
 def mapped_config(config: RunConfig, directory: Path, rows: int) -> RunConfig:
@@ -67,7 +85,8 @@ def mapped_config(config: RunConfig, directory: Path, rows: int) -> RunConfig:
     session = config.session
     if not session.reserve:
         session = session.model_copy(update={"reserve": rows + CHUNK})
-    recording = RecordingConfig(file=directory.resolve() / RECORDING)
+    odometry = UNCORRECTED if config.recording is None else config.recording.odometry
+    recording = RecordingConfig(file=directory.resolve() / RECORDING, odometry=odometry)
     return config.model_copy(update={"live": None, "recording": recording, "session": session})
 
 

@@ -18,13 +18,14 @@ from ratslam.live.arm_session import prepare_arm_session
 from ratslam.live.create_session import prepare_create_session
 from ratslam.live.live_robot import RECORDING, LiveRobot, quantiles
 from ratslam.live.mapper_process import Mapper
+from ratslam.live.topics_session import prepare_topics_session
 from ratslam.runs.run import catch_interrupt
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import Fault, SessionOutcome
 from robot.drivers.processes import urgent
 from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
-from robot.live.selftest import check_disk, find_devices, start_and_check
+from robot.live.selftest import check_disk
 from robot.recordings.mcap_writer import Recorder
 from tactile.base.files import require_new_file
 from tactile.calibration import Calibration
@@ -40,6 +41,7 @@ def run_live_session(
     mapping: Callable[..., None] | None = None,
     armed: Callable[[Path], None] = lambda directory: None,
     view: str | None = None,
+    resume: Path | None = None,
 ) -> tuple[Fault, Scorecard | None]:
     """Finds the devices, compiles, tests them, drives or moves, maps and scores.
 
@@ -49,6 +51,7 @@ def run_live_session(
         directory: the new run directory. log: called with each line of progress.
         mapping: main function of the mapper process; None: `ratslam.live.mapper_process.run_mapper`.
         armed: called with the directory when the session begins. view: target of a live view, or None.
+        resume: map to continue, or None.
 
     Returns:
         the outcome of the session with its finding, and the score of the map, if there is one.
@@ -57,13 +60,17 @@ def run_live_session(
         InputError: the session could not be armed.
     """
     assert config.live is not None
-    choose = prepare_arm_session if config.live.create is None else prepare_create_session
+    choose: Callable[..., Callable[[Callable[[], bool]], LiveRobot]] = prepare_arm_session
+    if config.live.create is not None:
+        choose = prepare_create_session
+    elif config.live.topics is not None:
+        choose = prepare_topics_session
     require_new_file(directory, parents=True)
     open_robot = choose(config, directory)
     log(check_disk(config.live, directory))
     with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping) as mapper:
         robot = open_robot(stopped)
-        robot.job = robot.job._replace(view=view)
+        robot.view, robot.resume = view, resume
         fault, standing, card = None, False, None
         try:
             with robot.rig as rig:
@@ -90,14 +97,12 @@ def run_live_session(
                 card = mapper.finish(not fault.outcome.planned)
         finally:
             if fault is not None:
-                head = robot.rig.head
                 report = {
                     "outcome": fault.outcome.name.lower(),
                     "detail": fault.detail,
                     "standing": standing,
                     f"{robot.unit}s": robot.count,
                     **robot.report(),
-                    "head": head.decoder.counts._asdict() | {"stalls": head.stalls},
                     "mapper_s": quantiles([result.seconds for result in mapper.mapped]),
                 }
                 text = json.dumps(report, indent=2) + "\n"
@@ -109,11 +114,12 @@ def run_live_session(
 def _prepare(robot: LiveRobot, mapper: Mapper, log: Callable[[str], None]) -> Calibration | None:
     """Finds, tests and calibrates the devices, while the mapper compiles and makes its run directory."""
     rig, late = robot.rig, SessionOutcome.MAPPER_GONE
-    for line in find_devices(rig):
+    for line in robot.find():
         log(line)
     log("mapper: compiling")
-    rig.wait_until(mapper.prepare(robot.job), START_TIMEOUT, late, "compiling")
-    for line in start_and_check(rig):
+    job = robot.job._replace(view=robot.view, resume=robot.resume)
+    rig.wait_until(mapper.prepare(job), START_TIMEOUT, late, "compiling")
+    for line in robot.check():
         log(line)
     calibration = robot.calibrate(log)
     rig.wait_until(mapper.prepare(calibration), START_TIMEOUT, late, "the mapper's start")

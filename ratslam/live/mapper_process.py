@@ -24,6 +24,8 @@ import numpy as np
 from evaluation.metrics.scorecard import Scorecard
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.processes import step_back, withheld_signals
+from robot.live.map_publisher import Drawing
+from robot.recordings.cdr import PIECE
 from robot.sources.source import ClosedSource, Sample, SourceDescription
 from tactile.base.errors import InputError
 from tactile.calibration import Calibration
@@ -31,6 +33,8 @@ from tactile.whisker_geometry import ur10_head
 
 LOG = "mapper.log"
 """Log of the mapper process, in the run directory."""
+MOST_DRAWN = 1000
+"""Poses of a drawn path, about."""
 FINISH_TIMEOUT = 120.0
 """Time limit of scoring and plotting, s."""
 
@@ -42,7 +46,8 @@ class MappingJob(NamedTuple):
         config: its `recording` is the file that the session is recorded to.
         source: as in that file, without the calibration, which follows. directory: the new run directory.
         extent_m: largest distance from the start along x or y on the planned path, m.
-        view: target of a live view, or None.
+        view: target of a live view, or None. resume: map to continue, or None.
+        draws: whether the map as a whole is sent from time to time.
     """
 
     config: RunConfig
@@ -50,6 +55,8 @@ class MappingJob(NamedTuple):
     directory: Path
     extent_m: float
     view: str | None = None
+    resume: Path | None = None
+    draws: bool = False
 
 
 class MappedSample(NamedTuple):
@@ -57,7 +64,8 @@ class MappedSample(NamedTuple):
 
     Attributes:
         number: of the sample; a front end may add the motion of one to the next, which then has no result.
-            pose: [3] online, in the map frame (m, m, rad). place: -1 for none. seconds: computing time.
+            pose: [3] online, in the map frame (m, m, rad), and spread: [3] its standard deviations.
+            place: -1 for none. seconds: computing time.
             doubt: see `ratslam.core.session.Step`. lost: whether the method has lost track of the position.
             points: [n, 2] contacts in base_link, m.
     """
@@ -69,6 +77,7 @@ class MappedSample(NamedTuple):
     doubt: float
     lost: bool
     points: np.ndarray
+    spread: np.ndarray
 
 
 class Mapper(AbstractContextManager["Mapper"]):
@@ -78,7 +87,7 @@ class Mapper(AbstractContextManager["Mapper"]):
         process: its main function; None: `run_mapper`.
 
     Attributes:
-        mapped: results of all samples mapped so far, in order.
+        mapped: results of all samples mapped so far, in order. drawing: the newest map as a whole, or None.
     """
 
     def __init__(self, process: Any = None) -> None:
@@ -90,6 +99,7 @@ class Mapper(AbstractContextManager["Mapper"]):
             self._process.start()
         theirs.close()
         self.mapped: list[MappedSample] = []
+        self.drawing: Drawing | None = None
         self._asked = self._stages = 0
         self._failed: InputError | str = ""  # a refusal of the job, or an error
         self._card: Scorecard | None = None
@@ -120,9 +130,15 @@ class Mapper(AbstractContextManager["Mapper"]):
 
         return done
 
-    def offer(self, sample: Sample) -> None:
-        """Passes the next sample; returns at once."""
+    def offer(self, sample: Sample, begins: bool = False) -> None:
+        """Passes the next sample; returns at once.
+
+        Args:
+            begins: whether no odometry leads to it, so that it begins a piece of the map.
+        """
         self._offered.append(time.monotonic())
+        if begins:
+            self._outbox.put(PIECE)
         self._outbox.put(sample)
 
     def behind(self) -> float:
@@ -138,6 +154,8 @@ class Mapper(AbstractContextManager["Mapper"]):
                 message = self._line.recv()
                 if isinstance(message, MappedSample):
                     self.mapped.append(message)
+                elif isinstance(message, Drawing):
+                    self.drawing = message
                 elif isinstance(message, Scorecard):
                     self._card = message
                 elif message is True:
@@ -193,7 +211,7 @@ class PipeSource(ClosedSource):
 
     Attributes:
         interrupted: whether the session ended early. received: arrival of the last sample, s. count: samples
-            so far.
+            so far. begins: whether no odometry leads to the last sample.
     """
 
     name, digest, length = "live", "", None
@@ -202,10 +220,11 @@ class PipeSource(ClosedSource):
         self.rate_hz, self.view_shape, self.whiskers = like.rate_hz, like.view_shape, like.whiskers
         self.info = like.info
         self.interrupted = True  # until the parent sends the flag
-        self.received, self.count = 0.0, 0
+        self.received, self.count, self.begins = 0.0, 0, False
         self._line = line
 
     def __iter__(self) -> Iterator[Sample]:
+        piece = False
         while True:
             try:
                 message = self._line.recv()
@@ -214,6 +233,10 @@ class PipeSource(ClosedSource):
             if isinstance(message, bool):
                 self.interrupted = message
                 return
+            if message == PIECE:
+                piece = True
+                continue
+            self.begins, piece = piece, False
             self.received, self.count = time.monotonic(), self.count + 1
             yield message
 
@@ -239,6 +262,7 @@ def _map(line: Connection) -> None:
     from ratslam.runs.settings.completion import complete
     from ratslam.service.viewer_link import open_viewer
     from robot.sources.in_memory import NO_ODOMETRY
+    from robot.sources.odometry import correct_odometry
     from robot.touch_source import open_touch_source
     from tactile.base.types import observation
 
@@ -248,30 +272,52 @@ def _map(line: Connection) -> None:
         source = open_touch_source(fed, config.touch)  # for its shapes: no sample is read without calibration
         check_finished_map(config, source)
         session = build_session(config, source)
-        session.warm(observation(NO_ODOMETRY, view_shape=source.view_shape, whiskers=source.whiskers))
+        like = observation(NO_ODOMETRY, view_shape=source.view_shape, whiskers=source.whiskers)
+        session.warm(like)
         gc.collect()
         gc.freeze()  # what compiling has left need not be searched again: a full collection takes 0.1 s
         line.send(True)
         fed.info = fed.info.model_copy(update={"calibration": line.recv()})  # EOFError: the parent has ended
-        source = open_touch_source(fed, config.touch)
-        with open_runner(config, source, job.directory, session=session, observers=observers) as runner:
+        read = correct_odometry(fed, config.recording.odometry) if config.recording else fed
+        source = open_touch_source(read, config.touch)
+        watchers = [*observers, _drawer(line)] if job.draws else observers
+        with open_runner(config, source, job.directory, job.resume, session, watchers) as runner:
             # Sends the output of the process, including tracebacks, to a file: the terminal is the parent's.
             path = job.directory / LOG
             with path.open("ab") as file:
                 os.dup2(file.fileno(), sys.stderr.fileno())
+            if job.resume is not None:  # with as many rows as the map has
+                session.warm(like)
             line.send(True)
             for sample in source:
+                if fed.begins:
+                    runner.session.begin_piece()
                 (step,) = runner.process([sample])
                 took = time.monotonic() - fed.received
                 estimate, touch = step.estimate, config.touch
                 points = felt_points(sample.reading, touch.image, ur10_head(touch.head))
                 result = MappedSample(
                     fed.count - 1, np.asarray(step.pose), int(estimate.place), took, step.doubt,
-                    bool(estimate.lost), points,
+                    bool(estimate.lost), points, np.asarray(estimate.spread, float),
                 )  # fmt: skip
                 _send(line, result)
             if runner.session.steps:
                 _send(line, runner.finish(fed.interrupted))
+
+
+def _drawer(line: Connection) -> Callable[[Any], None]:
+    """An observer of the run that sends the map as a whole whenever it is reported."""
+
+    def observe(message: Any) -> None:
+        report = message[1] if isinstance(message, tuple) and len(message) == 2 else None
+        if report is None or report.path is None:
+            return
+        path = report.path[:: max(1, len(report.path) // MOST_DRAWN)]
+        grid = report.grid
+        drawing = Drawing(path) if grid is None else Drawing(path, grid.probability, grid.origin, grid.cell)
+        _send(line, drawing)
+
+    return observe
 
 
 def _send(line: Connection, message: Any) -> None:

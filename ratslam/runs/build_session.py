@@ -104,7 +104,7 @@ def open_source(
     if config.recording is None and config.live is None:
         cure = "ratslam.Slam takes `info` instead: the source of the readings, or a SourceDescription"
         raise InputError("config", "no source", "a recording or a simulation", cure)
-    if config.recording is None:
+    if config.recording is None or config.recording.file is None:
         cure = "`python -m ratslam live` runs it; `run` maps the recording that it makes"
         raise InputError("live", "a live session", "a recording or a simulation", cure)
     return open_recording(config.recording, _warning(report, warnings))

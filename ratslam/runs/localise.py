@@ -102,7 +102,12 @@ def recorded_alike(file: Path, saved: SavedMap, assignments: Sequence[str] = ())
     like, file = saved.config.recording, file.resolve()
     if like is not None and like.topics is None and (file.is_dir() or file.suffix in (".bag", ".db3")):
         cure = f"`python -m ratslam doctor {file} --like {saved.path} -o FILE.yaml`, and localise FILE.yaml"
-        raise InputError(str(file), "a bag or a folder", f"such a recording as {like.file.name}", cure)
+        raise InputError(
+            str(file),
+            "a bag or a folder",
+            f"such a recording as {Path(like.file or '').name}",
+            cure,
+        )
     recording = RecordingConfig(file=file) if like is None else like.model_copy(update={"file": file})
     sources = dict.fromkeys(SourceConfig.model_fields) | {"touch": saved.config.touch, "recording": recording}
     text = dump(saved.config.model_copy(update=sources))

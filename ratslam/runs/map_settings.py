@@ -240,7 +240,7 @@ def _views_of(config: RunConfig) -> tuple[str, dict[str, Any]]:
         topic = recording.topics.views
         kept = {} if topic is None else topic.model_dump(include={"rows", "columns", "max_range", "heights"})
         return "topics of a bag", image | flat_settings(kept, "recording.topics.views.")
-    if recording.file.suffix.lower() in VIDEO_SUFFIXES:
+    if recording.file is not None and recording.file.suffix.lower() in VIDEO_SUFFIXES:
         return "frames of a video", image
     table = recording.table
     if table.views is None:

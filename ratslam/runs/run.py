@@ -13,6 +13,7 @@ from itertools import islice
 from pathlib import Path
 from types import FrameType
 
+import numpy as np
 from tqdm import tqdm
 
 from evaluation.metrics.scorecard import Scorecard
@@ -69,8 +70,16 @@ def process_source(runner: Runner, source: Source) -> bool:
     samples = islice(iter(source), runner.skipped, None)
     total = None if source.length is None else source.length - runner.skipped
     with _bar(source, "step", total) as bar, catch_interrupt(LAST_TASK) as interrupted:
-        begun = False
-        while not interrupted() and (chunk := list(islice(samples, CHUNK - runner.session.steps % CHUNK))):
+        begun, number = False, runner.skipped
+        pieces = sorted(getattr(source, "begins", ()))
+        while not interrupted():
+            if number in pieces:
+                runner.session.begin_piece()
+            until = next((first for first in pieces if first > number), np.inf)
+            longest = min(CHUNK - runner.session.steps % CHUNK, until - number)
+            if not (chunk := list(islice(samples, int(longest)))):
+                break
+            number += len(chunk)
             begun, steps = True, runner.process(chunk)
             bar.update(len(chunk))
             bar.set_postfix(places=int(steps[-1].estimate.place) + 1, refresh=False)

@@ -151,10 +151,10 @@ def diagnose_live(config: RunConfig, name: str, directory: Path) -> Diagnosis:
     live = config.live
     if live is None:
         raise InputError(name, "no section `live`", "the configuration of a live session")
-    robot = "an arm" if live.create is None else "a Create"
+    robot = "topics" if live.topics is not None else "an arm" if live.create is None else "a Create"
     passed = [f"settings: backend {config.backend}, {robot}"]
     try:
-        for line in check_session(live, config.touch.head, directory):
+        for line in check_session(live, config.touch.head, directory, config.recording):
             passed.append(line)  # those before a failure count
     except (InputError, SessionFault) as error:
         return Diagnosis(f"{name}: the live session cannot start", (), tuple(passed), (str(error),))

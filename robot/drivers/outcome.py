@@ -37,6 +37,9 @@ class SessionOutcome(Enum):
     HEAD_SILENT = "no data from the head: check its supply, and whether another program reads it"
     HEAD_GARBLED = "unreadable data from the head: check the cable and the decoder's settings"
     CLOCK_JUMPED = "a device's clock jumped: restart that device"
+    CONNECTION_LOST = "no connection to the robot: check its bridge and the network, then start again"
+    TOPIC_SILENT = "check the node that publishes and start again, or raise `live.topics.patience`"
+    TOPIC_UNUSABLE = "messages cannot be used: correct what is reported and start again"
     DISK_FULL = "free disk space; the recording is complete up to that point"
     MAPPER_GONE = "the SLAM process ended: see its log; `run` on the recording, if there is one, maps it"
 

@@ -19,7 +19,7 @@ from robot.drivers.head.reader import HeadReader
 from robot.drivers.head.usb_protocol import to_radians
 from robot.drivers.outcome import SessionOutcome
 from robot.live.live_config import LiveConfig
-from robot.live.polling import AsyncMapper, OperatorStop, PolledRig, SessionFault, check_mapper, session_fault
+from robot.live.polling import AsyncMapper, HeadRig, OperatorStop, SessionFault, check_mapper, session_fault
 from robot.simulation.create import state_machine
 from robot.simulation.create.state_machine import CreateState, MachineState, motion_end, next_state
 from robot.simulation.create.strain_sensors import fixed_whiskers
@@ -42,7 +42,7 @@ MAX_READ_TIME = 1.0
 """Longest wait for a reading, s: the robot has another fault before."""
 
 
-class CreateRig(PolledRig):
+class CreateRig(HeadRig):
     """The robot and the whiskers of a session; a context manager that leaves the robot at rest.
 
     Attributes:
@@ -65,7 +65,7 @@ class CreateRig(PolledRig):
         self._free = self.epoch  # newest time at which the bumper was not pressed
 
     def poll(self) -> None:
-        """Reads the samples of the whiskers and the state of the robot; see `PolledRig`."""
+        """Reads the samples of the whiskers and the state of the robot; see `HeadRig`."""
         for frames, arrival in self.stream.take():
             if self.stream.restarts != self._connections:
                 self._connections = self.stream.restarts

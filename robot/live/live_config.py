@@ -58,6 +58,25 @@ class GoalConfig(Settings):
     """Number of new ways for a goal, after which it counts as blocked."""
 
 
+class TopicsLiveConfig(Settings):
+    """A running robot, simulator or player that publishes topics, which `recording.topics` assigns."""
+
+    source: str = Field(min_length=1)
+    """Address: `ws://HOST:8765` of a Foxglove bridge, or `wss://` with TLS."""
+    max_wait: PositiveFloat = 0.2
+    """Longest time that a view waits for the odometry at its stamp, s; then it is dropped, and its motion is
+    part of the next one's."""
+    patience: PositiveFloat = 60.0
+    """Time without connection, odometry or views after which the session ends, s."""
+    minutes: PositiveFloat | None = None
+    """Duration of the session; null: until Ctrl-C."""
+    record: tuple[str, ...] = ()
+    """Topics that are recorded besides those that are used, such as a wrench."""
+    publish: bool = False
+    """Whether pose, path and health of the map are published to the robot, once a second, under /ratslam;
+    never a velocity."""
+
+
 ARM_ONLY = ("arm", "plan", "waypoints", "whisks", "odometry", "noise", "lift", "budget", "grace")
 """Settings without a meaning for a Create."""
 
@@ -84,10 +103,13 @@ class LivePlanConfig(SimulationConfig):
 
 
 class LiveConfig(Settings):
-    """A session of `python -m ratslam live config.yaml`: an arm with a head, or a Create with whiskers."""
+    """A session of `python -m ratslam live config.yaml`: an arm with a head, a Create with whiskers, or the
+    topics of a running robot."""
 
     create: CreateLiveConfig | None = None
     """A Create instead of the arm; of the settings below it uses `head`, `gap`, `residual` and `room`."""
+    topics: TopicsLiveConfig | None = None
+    """The topics of a running robot; of the settings below it uses `budget` and `room`."""
     arm: ArmConfig = ArmConfig()
     """The arm and its limits."""
     head: HeadLinkConfig = HeadLinkConfig()
@@ -131,4 +153,7 @@ class LiveConfig(Settings):
         given = [name for name in ARM_ONLY if name in self.model_fields_set]
         if self.create is not None and given:
             raise ValueError(f"create and {', '.join(given)}: a session has one robot, a Create or an arm")
+        given = [name for name in ("create", *ARM_ONLY) if name in self.model_fields_set - {"budget"}]
+        if self.topics is not None and given:
+            raise ValueError(f"topics and {', '.join(given)}: a session has one robot")
         return self

@@ -23,7 +23,7 @@ from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.driver_config import tcp_heading
 from robot.live.live_config import LiveConfig
-from robot.live.polling import TICK, OperatorStop, PolledRig, SessionFault, session_fault
+from robot.live.polling import TICK, HeadRig, OperatorStop, SessionFault, session_fault
 from robot.simulation.head.odometry_errors import OdometryErrors, motions_between
 from robot.sources.odometry import from_velocities
 from tactile.base.random_streams import stream
@@ -108,7 +108,7 @@ MAX_REST_TIME, REST_TIME = 2.0, 0.3
 """Longest wait for a stopped arm, and required time at rest, s: after a contact it stops, then backs off."""
 
 
-class Rig(PolledRig):
+class Rig(HeadRig):
     """The two devices of a session; a context manager that leaves both at rest.
 
     Attributes:
@@ -135,7 +135,7 @@ class Rig(PolledRig):
         self._seen = 0
 
     def poll(self) -> None:
-        """Reads the data of both devices; see `PolledRig`."""
+        """Reads the data of both devices; see `HeadRig`."""
         for frames, arrival in self.stream.take():
             if self.recorder is not None:
                 self.recorder.add_frames(frames, arrival - self.epoch)

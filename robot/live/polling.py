@@ -1,6 +1,7 @@
 """What both robots share in a live session: polling, the samples of a head, faults that end it, the mapper.
 
-`PolledRig` is the base of the rigs: it waits for conditions while the devices are polled, and records events.
+`PolledRig` is the base of the rigs: it waits for conditions while the devices are polled, and records events;
+`HeadRig` is that of robots with whiskers.
 `_HeadStream` collects the samples of a head, with its clock. `AsyncMapper` is the mapper as the loops see it.
 """
 
@@ -106,18 +107,17 @@ class _HeadStream:
 
 
 class PolledRig:
-    """The devices of a session, polled a hundred times a second.
+    """What a session polls.
 
     Args:
-        head: of the whiskers. stopped: whether the operator has requested the end.
+        stopped: whether the operator has requested the end.
 
     Attributes:
-        stream: samples and clock of the head. epoch: time 0 of the session on the host's clock, s. recorder:
-            recorder of all data, or None.
+        epoch: time 0 of the session on the host's clock, s. recorder: recorder of all data, or None.
     """
 
-    def __init__(self, config: LiveConfig, head: HeadReader, stopped: Callable[[], bool]) -> None:
-        self.config, self.head, self.stream = config, head, _HeadStream(head)
+    def __init__(self, config: LiveConfig, stopped: Callable[[], bool]) -> None:
+        self.config = config
         self.epoch = time.monotonic()
         self.recorder: LiveRecorder | None = None
         self._stopped = stopped
@@ -147,13 +147,6 @@ class PolledRig:
             self.poll()
             time.sleep(TICK)
 
-    def await_samples(self, whose: str) -> None:
-        """Waits until the head (`whose`: its name and verb) sends samples again. The reader limits the time
-        and turns it into a fault; see `wait_until`."""
-        self.record_event("held", f"{whose} no samples")
-        self.wait_until(lambda: self.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, whose)
-        self.record_event("resumed", f"{whose} samples")
-
     def __enter__(self) -> Self:
         return self
 
@@ -161,6 +154,28 @@ class PolledRig:
         """Records an event."""
         if self.recorder is not None:
             self.recorder.add_event(self.now(), name, text)
+
+
+class HeadRig(PolledRig):
+    """The devices of a robot with whiskers.
+
+    Args:
+        head: of the whiskers.
+
+    Attributes:
+        stream: samples and clock of the head.
+    """
+
+    def __init__(self, config: LiveConfig, head: HeadReader, stopped: Callable[[], bool]) -> None:
+        super().__init__(config, stopped)
+        self.head, self.stream = head, _HeadStream(head)
+
+    def await_samples(self, whose: str) -> None:
+        """Waits until the head (`whose`: its name and verb) sends samples again. The reader limits the time
+        and turns it into a fault; see `wait_until`."""
+        self.record_event("held", f"{whose} no samples")
+        self.wait_until(lambda: self.stream.streaming, float("inf"), SessionOutcome.HEAD_GONE, whose)
+        self.record_event("resumed", f"{whose} samples")
 
 
 class AsyncMapper(Protocol):
@@ -171,7 +186,7 @@ class AsyncMapper(Protocol):
     @property
     def failure(self) -> str: ...
     def behind(self) -> float: ...
-    def offer(self, sample: Sample) -> None: ...
+    def offer(self, sample: Sample, begins: bool = False) -> None: ...
 
 
 def check_mapper(mapper: AsyncMapper) -> None:

@@ -88,6 +88,12 @@ class LiveRecorder(AbstractContextManager["LiveRecorder"]):
                 self._tape.write(content)
                 self._tape.flush()
 
+    def add_message(self, topic: str, kind: str, definition: str, arrival: int, content: bytes) -> None:
+        """Adds a message of a robot's topic; see `Recorder.append_message`."""
+        with self._writing(arrival / 1e9) as able:
+            if able:
+                self._tape.append_message(topic, kind, definition, arrival, content)
+
     def add_event(self, time: float, name: str, text: str) -> None:
         """Adds an event and flushes the file.
 

@@ -1,4 +1,4 @@
-"""Self-tests of a session's devices and of this machine, for an arm with a head and for a Create.
+"""Self-tests of a session's devices and of this machine, for an arm with a head, a Create, and topics.
 
 Nothing moves in a self-test. A session runs its two steps itself: it finds the devices, and later, when the
 mapper is ready, starts and checks them.
@@ -22,7 +22,9 @@ from robot.live.arm_route import check_targets, plan_path
 from robot.live.create_rig import CreateRig
 from robot.live.live_config import LiveConfig
 from robot.live.live_rig import Rig
-from robot.live.polling import PolledRig
+from robot.live.polling import HeadRig
+from robot.live.topics_rig import TopicsRig, require_topics
+from robot.recordings.recording_config import RecordingConfig
 from tactile.base.errors import InputError, os_errors_of
 from tactile.whisker_geometry import HeadConfig, ur10_head
 
@@ -32,18 +34,30 @@ MIN_RATE_SHARE = 0.9
 """Required share of a stream's nominal rate."""
 
 
-def check_session(config: LiveConfig, head: HeadConfig, directory: Path) -> Iterator[str]:
+def check_session(
+    config: LiveConfig, head: HeadConfig, directory: Path, recording: RecordingConfig | None = None
+) -> Iterator[str]:
     """Checks what a session needs, without a motion; yields a line of text for each passed check. No program
     is started on an arm, which then cannot move.
 
     Args:
         head: geometry of an arm's whisker head. directory: in which the session would make its run directory.
+        recording: assigns the topics of a robot that publishes them.
 
     Raises:
         InputError: a check failed; the error gives its cure.
         robot.live.polling.SessionFault: a device failed meanwhile.
     """
     yield check_disk(config, directory)
+    if config.topics is not None:
+        told = list[str]()
+        with TopicsRig(
+            config, require_topics(config.topics, recording), lambda: False, told.append
+        ) as talker:
+            yield from talker.find()
+            yield from talker.check()
+        yield from told
+        return
     if config.create is not None:
         with CreateRig(config, lambda: False) as robot:
             yield from find_devices(robot)
@@ -138,7 +152,7 @@ def start_and_check(rig: Rig | CreateRig) -> Iterator[str]:
         yield f"{clocks}, newest state {age * 1e3:.0f} ms old"
 
 
-def _check_stream(rig: PolledRig) -> str:
+def _check_stream(rig: HeadRig) -> str:
     """Listens to the head for a while and checks rate, damage and clock of its samples; returns a line of
     text."""
     head, residual = rig.head, rig.config.residual

@@ -128,6 +128,10 @@ class Malformed(ValueError):
     """A message that does not fit its schema."""
 
 
+PIECE = "piece"
+"""Name of the event before a sample that begins a piece of the map: no odometry leads to it."""
+
+
 class Event(NamedTuple):
     """An event of a live session. Attributes: time: s. name: one word, such as `fault` or `discontinuity`.
     text: details."""

@@ -34,7 +34,9 @@ def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
 
 def _open(config: RecordingConfig, judge: InputJudge) -> Source:
     """The recording as it is. Readers are imported when they are needed: some are slow to load."""
-    file, suffix = config.file, config.file.suffix.lower()
+    file = config.file
+    assert file is not None
+    suffix = file.suffix.lower()
     if suffix == ".mcap":
         from robot.recordings.mcap_reader import is_foreign
     whole = config.topics is not None or (file / "metadata.yaml").is_file()

@@ -325,6 +325,7 @@ class Recording(ClosedSource):
         truncated: whether the file ends early; its first `length` samples are readable.
         warning: that sentence, or ''.
         events: events of a live session: faults, discontinuities, dropped images.
+        begins: numbers of samples, from 0, to which no odometry leads: each begins a piece of the map.
         info: devices, world and origin, as stored; `raw_whiskers` is set from the readings.
 
     Raises:
@@ -341,7 +342,7 @@ class Recording(ClosedSource):
         self.digest = digest_of([path])
         scanner = McapScanner(path)
         columns = array("d")
-        events: list[Event] = []
+        events, begins = list[Event](), set[int]()
         raw_whiskers = False
         for entry in scanner.entries():
             if isinstance(entry.content, Sample):
@@ -349,6 +350,8 @@ class Recording(ClosedSource):
                 raw_whiskers |= not isinstance(entry.content.reading, Observation)
             elif isinstance(entry.content, Event):
                 events.append(entry.content)
+                if entry.content.name == cdr.PIECE:
+                    begins.add(scanner.count)
         description = scanner.description
         if description is None or not scanner.count:
             raise scanner.unreadable_error()
@@ -363,7 +366,9 @@ class Recording(ClosedSource):
         rows = np.frombuffer(columns).reshape(count, -1)
         inside = judge.stretch.rows(rows[:, 0], str(path))
         self._first, self._last = int(inside.argmax()), len(inside) - int(inside[::-1].argmax())
-        self.length, self.digest = self._last - self._first, judge.stretch.digest(self.digest)
+        self.length = self._last - self._first
+        self.begins = frozenset(n - self._first for n in begins if self._first < n < self._last)
+        self.digest = judge.stretch.digest(self.digest)
         time = self._check_columns(rows[self._first : self._last], judge)
         self.rate_hz = rate_of(time) or description.rate_hz
         if self.truncated:

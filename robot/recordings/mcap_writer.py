@@ -67,6 +67,7 @@ class Recorder(AbstractContextManager["Recorder"]):
         self._chunk_s = chunk_s
         self._pending, self._flushed = 0, -np.inf  # bytes in the open chunk; time of the last closed one
         self._channels: dict[str, int] = {}
+        self._others: dict[str, int] = {}  # channels of other programs' topics
         self.count = 0
         self._number = 0
         self._failed = False
@@ -117,6 +118,20 @@ class Recorder(AbstractContextManager["Recorder"]):
         if self._pending >= _CHUNK_BYTES or abs(time - self._flushed) >= self._chunk_s:
             self.flush()
             self._flushed = time
+
+    def append_message(self, topic: str, kind: str, definition: str, time: int, content: bytes) -> None:
+        """Append a message of another program in CDR, as any bag has it.
+
+        Args:
+            kind: its type, which `definition` defines in the text of ROS 2. time: of its arrival, ns.
+        """
+        if topic not in self._others:
+            schema = self._writer.register_schema(kind, "ros2msg", definition.encode())
+            self._others[topic] = self._writer.register_channel(topic, "cdr", schema)
+        self._writer.add_message(self._others[topic], time, content, time)
+        self._pending += len(content)
+        if self._pending >= _CHUNK_BYTES:
+            self.flush()
 
     def flush(self) -> None:
         """Hand all messages so far to the operating system."""

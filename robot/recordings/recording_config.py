@@ -18,13 +18,14 @@ from tactile.base.settings import KeyPath
 class RecordingConfig(StretchConfig):
     """A recording to run on."""
 
-    file: Path
+    file: Path | None = None
     """The recording: `.mcap` (of ratslam), `.npz` (reference trace), `.csv` (odometry), a bag (`.bag`,
-    `.db3`, `.mcap`, a folder) or a video (`.mp4`, `.avi`, `.mkv`, `.mov`, `.webm`)."""
+    `.db3`, `.mcap`, a folder) or a video (`.mp4`, `.avi`, `.mkv`, `.mov`, `.webm`). Null: the topics of
+    `live.topics`."""
     table: CsvConfig = CsvConfig()
     """Columns of a `.csv` recording, or of the odometry and truth beside a video."""
     topics: TopicsConfig | None = None
-    """Topics of a bag."""
+    """Topics of a bag, or of a running robot."""
     video: VideoConfig = VideoConfig()
     """Times and odometry of a video."""
     image: ImageViewConfig = ImageViewConfig()
@@ -43,13 +44,16 @@ class RecordingConfig(StretchConfig):
         recording's file name: beside `aces_odom_gt.csv`, `*_scans.csv` is `aces_scans.csv`.
         """
         found = super().resolved(folder, here, at)
+        file = found.file
+        if file is None:
+            return found
         parts = {
-            key: getattr(found.table, key).model_copy(update={"file": _companion(found.file, part.file)})
+            key: getattr(found.table, key).model_copy(update={"file": _companion(file, part.file)})
             for key in ("views", "contacts", "labels", "pairs", "truth")
             if (part := getattr(self.table, key)) is not None and _names_companion(part.file)
         }
         given = {key: getattr(self.video, key) for key in ("stamps", "odometry")}
-        beside = {key: _companion(found.file, file) for key, file in given.items() if _names_companion(file)}
+        beside = {key: _companion(file, part) for key, part in given.items() if _names_companion(part)}
         table, video = found.table.model_copy(update=parts), found.video.model_copy(update=beside)
         return found.model_copy(update={"table": table, "video": video})
 

@@ -26,6 +26,7 @@ def read_video(config: RecordingConfig, judge: InputJudge) -> InMemorySource:
             not fit.
     """
     path, video = config.file, config.video
+    assert path is not None
     require_file(path)
     raise_errors(_contradictions(config))
     wheels = None

@@ -151,6 +151,7 @@ class _CorrectedSource:
         self.name, self.rate_hz, self.view_shape = source.name, source.rate_hz, source.view_shape
         self.whiskers, self.length, self.info = source.whiskers, source.length, source.info
         self.digest = digest
+        self.begins: frozenset[int] = getattr(source, "begins", frozenset())
 
     def __enter__(self) -> _CorrectedSource:
         self._source.__enter__()

@@ -60,7 +60,7 @@ class Recording(NamedTuple):
         if not Path(self.config).exists():
             return f"{self.config} does not exist; run the command in the repository"
         recording = self.configuration().recording
-        if recording is None or recording.file.exists():
+        if recording is None or recording.file is None or recording.file.exists():
             return ""
         return f"{recording.file} does not exist"
 

@@ -80,6 +80,12 @@ class SourceConfig(Settings):
     @classmethod
     def _one_source(cls, live: LiveConfig | None, info: ValidationInfo) -> LiveConfig | None:
         names = SOURCE_SECTIONS[:-1]
+        recording = info.data.get("recording")
+        if recording is not None and recording.file is None:
+            if live is not None and live.topics is not None:
+                return live  # the recording assigns the topics
+            if "recording" in info.data:
+                raise ValueError("recording.file is missing: a recording, or the topics of `live.topics`")
         sources = {name: info.data.get(name) for name in names} | {"live": live}
         given = [name for name, source in sources.items() if source is not None]
         if all(name in info.data for name in names) and not cls.fewest_sources <= len(given) <= 1:

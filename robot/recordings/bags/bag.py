@@ -11,7 +11,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from copy import copy
 from functools import cached_property
 from heapq import heappop, heappush, merge
@@ -91,7 +91,54 @@ class Topic(NamedTuple):
     total: int
 
 
-class Bag(AbstractContextManager["Bag"]):
+class Messages:
+    """Messages of topics, as the readers of a part need them: those of a bag, or of a running robot.
+
+    Attributes:
+        path: of the bag, or the address of the robot, for errors. topics: by name. clock: which times the
+            messages have, where they have a header.
+    """
+
+    path: Any
+    topics: dict[str, Topic]
+    clock: Clock
+
+    def warn(self, sentence: str) -> None:
+        """Tells a sentence, once."""
+        raise NotImplementedError
+
+    def usable(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any, Any]]:
+        """The messages of a topic that can be used: number, time of receipt in ns, content, and what `read`
+        makes of the content and its place."""
+        raise NotImplementedError
+
+    def topic(self, name: str, key: str, kinds: Iterable[str] = ()) -> Topic:
+        """The topic of this name; a leading slash may be missing.
+
+        Args:
+            key: configuration key of the name, for errors. kinds: types that it can have; () for any.
+
+        Raises:
+            InputError: there is no such topic, it has no messages, or another type.
+        """
+        spellings = (name, f"/{name}", name.removeprefix("/"))
+        found = next((self.topics[each] for each in spellings if each in self.topics), None)
+        if found is None:
+            raise missing_error(str(self.path), "topic", name, list(self.topics), key)
+        if not found.total:
+            raise InputError(f"{self.path}, {found.name}", "no messages", "at least one message")
+        if kinds and found.kind not in kinds:
+            said = f"messages of type {found.kind}"
+            raise InputError(f"{self.path}, {found.name}", said, f"one of {', '.join(kinds)}")
+        return found
+
+    def stamp(self, content: Any, received: int, clock: Clock | None = None) -> int:
+        """The time of a message received at this time, ns, by a clock; None: that of the settings."""
+        stamped = (clock or self.clock) == "header" and hasattr(content, "header")
+        return nanoseconds(content.header.stamp) if stamped else received
+
+
+class Bag(Messages, AbstractContextManager["Bag"]):
     """An open bag, a context manager.
 
     Args:
@@ -142,6 +189,8 @@ class Bag(AbstractContextManager["Bag"]):
             self._store: Any = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
             for kind in TRANSFORMS - self._store.fielddefs.keys():
                 self._store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
+            for each in (each for reader in readers for each in reader.connections):
+                learn_type(self._store, each.msgtype, each.msgdef.data)
             self._decode = self._store.deserialize_ros1 if first else self._store.deserialize_cdr
             self._readers, self._first = readers, first
             self.topics = self._list_topics([each for reader in listed for each in reader.connections])
@@ -150,7 +199,6 @@ class Bag(AbstractContextManager["Bag"]):
             raise InputError(str(path), "a bag without messages", "at least one message")
 
     def warn(self, sentence: str) -> None:
-        """Tells a sentence, once."""
         if sentence not in self._told:
             self._warn(sentence)
         self._told.add(sentence)
@@ -168,32 +216,9 @@ class Bag(AbstractContextManager["Bag"]):
                 topics[name] = Topic(name, both, max(known.total, totals[name]))
         return dict(sorted(topics.items()))
 
-    def topic(self, name: str, key: str, kinds: Iterable[str] = ()) -> Topic:
-        """The topic of this name; a leading slash may be missing.
-
-        Args:
-            key: configuration key of the name, for errors. kinds: types that it can have; () for any.
-
-        Raises:
-            InputError: there is no such topic, it has no messages, or another type.
-        """
-        spellings = (name, f"/{name}", name.removeprefix("/"))
-        found = next((self.topics[each] for each in spellings if each in self.topics), None)
-        if found is None:
-            raise missing_error(str(self.path), "topic", name, list(self.topics), key)
-        if not found.total:
-            raise InputError(f"{self.path}, {found.name}", "no messages", "at least one message")
-        if kinds and found.kind not in kinds:
-            said = f"messages of type {found.kind}"
-            raise InputError(f"{self.path}, {found.name}", said, f"one of {', '.join(kinds)}")
-        return found
-
     def usable(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any, Any]]:
-        """The messages of a topic that can be used: number, time of receipt in ns, content, and what `read`
-        makes of the content and its place.
-
-        Messages that cannot be decoded, or for which `read` raises `InputError`, are left out with a warning,
-        if these are few (see `leave_out`).
+        """As for `Messages`. Those that cannot be decoded, or for which `read` raises `InputError`, are left
+        out with a warning, if these are few (see `leave_out`).
 
         Raises:
             InputError: the bag is damaged, the topic's type is unknown or defined differently, or more
@@ -213,11 +238,6 @@ class Bag(AbstractContextManager["Bag"]):
                 yield number, time, content, value
         if first is not None:
             raise_errors(leave_out(spoilt, good + spoilt, "messages", first, self.warn))
-
-    def stamp(self, content: Any, received: int, clock: Clock | None = None) -> int:
-        """The time of a message received at this time, ns, by a clock; None: that of the bag."""
-        stamped = (clock or self.clock) == "header" and hasattr(content, "header")
-        return nanoseconds(content.header.stamp) if stamped else received
 
     def stamped(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any]]:
         """Number, time in ns, and what `read` makes of each message that can be used (see `usable`)."""
@@ -282,7 +302,8 @@ class Bag(AbstractContextManager["Bag"]):
     def _check_type(self, topic: Topic) -> None:
         where = f"{self.path}, {topic.name}"
         if topic.kind not in self._store.fielddefs:
-            raise InputError(where, f"messages of type {topic.kind}", "a type that ROS itself defines")
+            expected = "a type that ROS itself defines, or a file with its definition (MCAP)"
+            raise InputError(where, f"messages of type {topic.kind}", expected)
         everywhere = [each for reader in self._readers for each in reader.connections]
         connections = [each for each in everywhere if each.topic == topic.name]
         coded = {getattr(each.ext, "serialization_format", "cdr") for each in connections} - {"cdr"}
@@ -374,6 +395,18 @@ def _scanned(reader: Any, chosen: list[Any]) -> Iterator[tuple[Any, int, bytes]]
             moment, _, connection, raw = heappop(waiting)
             done += 1
             yield connection, moment, raw
+
+
+def learn_type(store: Any, kind: str, definition: str) -> None:
+    """Adds a message type that a store of rosbags does not know, by its definition in the text of ROS; one
+    that is missing, or that rosbags cannot read, is left unknown."""
+    from rosbags.typesys import TypesysError, get_types_from_msg
+
+    if kind in store.fielddefs or not definition:
+        return
+    with suppress(TypesysError, ValueError, KeyError):
+        new = get_types_from_msg(definition, kind)
+        store.register({name: fields for name, fields in new.items() if name not in store.fielddefs})
 
 
 def nanoseconds(stamp: Any) -> int:

@@ -13,7 +13,8 @@ import numpy as np
 
 from robot.recordings.bags import transforms
 from robot.recordings.bags.bag import Bag, Topic, leaps, nanoseconds
-from robot.recordings.bags.bag_reader import ARRAYS, JOINTS
+from robot.recordings.bags.bag_reader import ARRAYS, JOINTS, NAMED, TOUCHES, TouchReader
+from robot.recordings.bags.topics_config import TouchTopic
 from robot.recordings.bags.transforms import FORWARD, ODOMETRY, POSES, TWISTS, mount_of
 from robot.recordings.bags.views import (
     CLOUD,
@@ -143,7 +144,7 @@ _ROLES: dict[str, tuple[Role, ...]] = {
     **dict.fromkeys(TWISTS, ("odometry",)),
     **dict.fromkeys(POSES, ("odometry", "truth")),  # also of types that have both
     **dict.fromkeys((SCAN, CLOUD, *IMAGES), ("views",)),
-    **dict.fromkeys((JOINTS, *ARRAYS), ("touch",)),
+    **dict.fromkeys(TOUCHES, ("touch",)),
 }
 """What messages of a type can serve as."""
 
@@ -214,6 +215,9 @@ def _summary_of(content: Any, kind: str, where: str) -> Any:
         return Shape(f"{width} x {height} {encoding}, mean grey {grey.mean():.0f}", (width, height))
     if kind == JOINTS:
         return (len(content.name),), np.asarray(content.position, float)
+    if kind in NAMED:
+        values = TouchReader(kind, TouchTopic(topic="")).values(content, where)
+        return np.shape(values), values
     if kind in ARRAYS:
         sizes = tuple(int(dim.size) for dim in content.layout.dim)
         return sizes or (len(content.data),), np.asarray(content.data, float)
@@ -244,7 +248,7 @@ def _shape_of(bag: Bag, kind: str, kept: list[Any], stamps: list[int]) -> Shape:
         return Shape(f"{len(kept[0])} points, median {reach:.2g} m away")
     if kind in IMAGES:
         return kept[0]
-    if kind in (JOINTS, *ARRAYS):
+    if kind in TOUCHES:
         numbers = np.concatenate([value for _, value in kept])
         low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (np.nan, np.nan)
         words = f"{' x '.join(map(str, kept[0][0]))} values from {low:.3g} to {high:.3g}"

@@ -25,21 +25,54 @@ from tactile.base.se2 import integrate
 
 JOINTS = "sensor_msgs/msg/JointState"
 ARRAYS = ("std_msgs/msg/Float32MultiArray", "std_msgs/msg/Float64MultiArray")
+HAZARDS, PROXIMITY = (
+    f"irobot_create_msgs/msg/{name}" for name in ("HazardDetectionVector", "IrIntensityVector")
+)
+NAMED: dict[str, tuple[str, ...]] = {
+    HAZARDS: tuple(f"bump_{side}" for side in ("left", "front_left", "front_center", "front_right", "right")),
+    PROXIMITY: (),
+    "create_msgs/msg/Bumper": ("is_left_pressed", "is_right_pressed"),
+}
+"""Messages of a Create whose sensors have names, and those that are used unless `joints` names others, from
+the left; (): all of the first message."""
+TOUCHES = (JOINTS, *ARRAYS, *NAMED)
+"""Types of messages that can be touch."""
 
 
-def _read_touch(bag: Bag, config: TouchTopic) -> Series:
-    """Touch [M, R, C, 1] in 0..1."""
-    topic = bag.topic(config.topic, "recording.topics.touch", (JOINTS, *ARRAYS))
-    where = f"{bag.path}, {topic.name}"
-    names, shape, known = config.joints, None, list[str]()
+class TouchReader:
+    """Values of the messages of a topic; what the settings leave open is as in the first message.
 
-    def read(content: Any, place: str) -> np.ndarray | None:
-        nonlocal names, shape
-        if topic.kind == JOINTS:
-            known.extend(name for name in content.name if name not in known)
-            if names and not set(names) <= set(content.name):
+    Attributes:
+        shape: (R, C) of the sensors, None before the first message. known: names of all joints so far.
+    """
+
+    def __init__(self, kind: str, config: TouchTopic) -> None:
+        self._kind, self._config, self._names = kind, config, config.joints
+        self.shape: tuple[int, int] | None = None
+        self.known = dict[str, None]()
+
+    def values(self, content: Any, place: str) -> np.ndarray | None:
+        """[R * C] of a message, as recorded; None if it has not the joints that the settings name.
+
+        Raises:
+            InputError: values are missing or not finite, or not as many as in the first message.
+        """
+        joints = self._kind == JOINTS
+        if self._kind in NAMED:
+            found = named_values(self._kind, content)
+            self._names = self._names or NAMED[self._kind] or tuple(found)
+            absent = [name for name in self._names if name not in found and self._kind != HAZARDS]
+            if absent:
+                expected = f"one of {', '.join(found)}"
+                raise InputError(
+                    place, f"no sensor {absent[0]!r}", expected, "set recording.topics.touch.joints"
+                )
+            value = np.array([found.get(name, 0.0) for name in self._names])
+        elif joints:
+            self.known.update(dict.fromkeys(content.name))
+            if self._names and not set(self._names) <= set(content.name):
                 return None
-            value = _joint_values(content, names or tuple(content.name), config.use, place)
+            value = _joint_values(content, self._names or tuple(content.name), self._config.use, place)
         else:
             value, skip = np.asarray(content.data, float), int(content.layout.data_offset)
             if skip > len(value):
@@ -47,21 +80,41 @@ def _read_touch(bag: Bag, config: TouchTopic) -> Series:
             value = value[skip:]
         if not np.isfinite(value).all():
             raise InputError(place, f"touch is {value[~np.isfinite(value)][0]}", "a finite number")
-        shape = shape or _shape(content, len(value), config, place)
-        if len(value) != shape[0] * shape[1]:
-            expected = f"{shape[0]} x {shape[1]}, as in the first message"
+        self.shape = self.shape or _shape(content, len(value), self._config, place)
+        if len(value) != self.shape[0] * self.shape[1]:
+            expected = f"{self.shape[0]} x {self.shape[1]}, as in the first message"
             raise InputError(place, f"{len(value)} values", expected)
-        if topic.kind == JOINTS:
-            names = names or tuple(content.name)
+        if joints:
+            self._names = self._names or tuple(content.name)
         return value
 
-    rows = [row for row in bag.stamped(topic, read) if row[2] is not None]
+    def scaled(self, values: np.ndarray) -> np.ndarray:
+        """Values in the span of the settings, of which 0 to 1 is not exceeded."""
+        return (values - self._config.low) / (self._config.high - self._config.low)
+
+
+def named_values(kind: str, content: Any) -> dict[str, float]:
+    """The values of the sensors in a message whose sensors have names (`NAMED`); of hazards those that are
+    there, each 1."""
+    if kind == HAZARDS:
+        return {str(each.header.frame_id): 1.0 for each in content.detections}
+    if kind == PROXIMITY:
+        return {str(each.header.frame_id): float(each.value) for each in content.readings}
+    fields = ((name, value) for name, value in vars(content).items() if not hasattr(value, "stamp"))
+    return {name: float(value) for name, value in fields if isinstance(value, (bool, int, float))}
+
+
+def _read_touch(bag: Bag, config: TouchTopic) -> Series:
+    """Touch [M, R, C, 1] in 0..1."""
+    topic = bag.topic(config.topic, "recording.topics.touch", TOUCHES)
+    where, reader = f"{bag.path}, {topic.name}", TouchReader(topic.kind, config)
+    rows = [row for row in bag.stamped(topic, reader.values) if row[2] is not None]
     numbers, stamps, values = ([row[k] for row in rows] for k in range(3))
     if not values:
-        absent = next((name for name in names if name not in known), None)
+        absent = next((name for name in config.joints if name not in reader.known), None)
         if absent is not None:
-            raise missing_error(where, "joint", absent, known, "recording.topics.touch.joints")
-    scaled = (np.array(values) - config.low) / (config.high - config.low)
+            raise missing_error(where, "joint", absent, list(reader.known), "recording.topics.touch.joints")
+    scaled = reader.scaled(np.array(values))
     series = as_series(bag, where, numbers, stamps, scaled)
     errors = list(series.errors)
     outside = float(np.mean((scaled < 0) | (scaled > 1)))
@@ -69,8 +122,8 @@ def _read_touch(bag: Bag, config: TouchTopic) -> Series:
         found = f"values from {np.nanmin(values):.4g} to {np.nanmax(values):.4g}, most of them outside"
         expected = f"{config.low:g} to {config.high:g}"
         errors.append(InputError(where, found, expected, "set recording.topics.touch.low and high"))
-    assert shape is not None
-    views = np.clip(series.values, 0.0, 1.0).reshape(-1, *shape, 1)
+    assert reader.shape is not None
+    views = np.clip(series.values, 0.0, 1.0).reshape(-1, *reader.shape, 1)
     return series._replace(values=views, errors=errors)
 
 
@@ -115,6 +168,7 @@ def read_bag(settings: RecordingConfig, judge: InputJudge) -> InMemorySource:
         InputError: the bag is damaged, topics are missing or of another type, or values are impossible.
     """
     path, config = settings.file, settings.topics or TopicsConfig()
+    assert path is not None
     with Bag(path, judge.say, judge.stretch, config.clock) as bag:
         config = _with_preset(bag, config)
         if config.views is not None and config.touch is not None:

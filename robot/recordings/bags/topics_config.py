@@ -99,7 +99,8 @@ class ViewsTopic(Topic):
 
 
 class TouchTopic(Topic):
-    """Touch sensors as a view, from JointState, Float32MultiArray or Float64MultiArray messages."""
+    """Touch sensors as a view, from JointState, Float32MultiArray or Float64MultiArray messages, or from the
+    bumpers, hazards and proximity sensors of a Create."""
 
     topic: str
     """The topic."""
@@ -111,7 +112,7 @@ class TouchTopic(Topic):
     """Which values of JointState messages."""
     joints: Annotated[tuple[str, ...], FromList] = ()
     """Joints of JointState messages, in the order of the pixels; messages without them are for others. Empty:
-    all joints of the first message."""
+    all joints of the first message. Of a Create, the frames or fields of its sensors; empty: its bumpers."""
     low: float = 0.0
     """Value that becomes 0; lower ones too."""
     high: float = 1.0

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robot.recordings.bags import bag as bags
-from robot.recordings.bags.bag import Bag, Series, as_series
+from robot.recordings.bags.bag import Bag, Messages, Series, as_series
 from robot.recordings.bags.topics_config import OdometryTopic, PoseTopic
 from robot.recordings.sanity_checks import leave_out, nonfinite_errors, still_axis
 from robot.sources.input_files import missing_error, raise_errors
@@ -117,7 +117,7 @@ class Mount(NamedTuple):
 FORWARD = Mount(np.eye(3), np.zeros(3))
 
 
-def read_links(bag: Bag, name: str) -> Links:
+def read_links(bag: Messages, name: str) -> Links:
     """All links on /tf or /tf_static, in any namespace; of fixed links (`/tf_static`) the last transform.
 
     Raises:
@@ -163,7 +163,7 @@ def _chain_between(links: Links, parent: str, child: str) -> _Chain | None:
     return None if parent == child else ways.get(child)
 
 
-def mount_of(bag: Bag, body: str, sensor: str) -> Mount | None:
+def mount_of(bag: Messages, body: str, sensor: str) -> Mount | None:
     """The mount of a sensor's frame on a robot's; None if the bag does not say. Links that only /tf has are
     taken as they are at first.
 
@@ -180,7 +180,7 @@ def mount_of(bag: Bag, body: str, sensor: str) -> Mount | None:
         if (chain := next(filter(None, chains), None)) is not None:
             whole = np.eye(4)
             for frames, down in chain:
-                whole = whole @ _matrices(links[frames], np.zeros(1), np.zeros(1), down)[0]
+                whole = whole @ _matrices(links[frames][:1], np.zeros(1), np.zeros(1), down)[0]
             return Mount(whole[:3, :3], whole[:3, 3])
     return None
 
@@ -265,6 +265,30 @@ def read_odometry(bag: Bag, config: OdometryTopic) -> Series:
     return series._replace(values=motion, poses=None if series.held else values)
 
 
+def holds_velocities(config: PoseTopic, kind: str) -> bool:
+    """Whether the velocities of messages of this type are used, not their poses."""
+    wanted = isinstance(config, OdometryTopic) and (config.use == "twist" or kind not in POSES)
+    return wanted and kind in TWISTS
+
+
+def value_of(config: PoseTopic, kind: str, content: Any, place: str) -> Vector | None:
+    """The pose (x m, y m, heading rad) in a message of this type, or its velocities (m/s, m/s, rad/s); None
+    if it is of other frames than the settings name.
+
+    Raises:
+        InputError: a number is not finite, or the orientation is 0.
+    """
+    wanted = tuple(frame.lstrip("/") for frame in config.frames)
+    if wanted != frames_of(content)[: len(wanted)]:
+        return None
+    if not holds_velocities(config, kind):
+        return pose_in_plane(*POSES[kind](content), place, config.plane)
+    value = twist_in_plane(TWISTS[kind](content))
+    if not np.isfinite(value).all():
+        raise InputError(place, f"the velocities are {', '.join(map(str, value))}", "finite numbers")
+    return value
+
+
 def read_poses(bag: Bag, config: PoseTopic, role: str = "truth") -> Series:
     """Poses [M, 3] (x m, y m, heading rad) of a topic or between two frames; of odometry, also velocities.
 
@@ -281,21 +305,14 @@ def read_poses(bag: Bag, config: PoseTopic, role: str = "truth") -> Series:
     known = POSES | TWISTS if role == "odometry" else POSES
     topic = bag.topic(config.topic, f"recording.topics.{role}", known)
     where = f"{bag.path}, {topic.name}"
-    wanted_twist = isinstance(config, OdometryTopic) and (config.use == "twist" or topic.kind not in POSES)
-    twist = wanted_twist and topic.kind in TWISTS
+    twist = holds_velocities(config, topic.kind)
     rows, kept, points, doubts = list[Any](), list[Any](), list[Any](), dict[str, list[str]]()
-    wanted = tuple(frame.lstrip("/") for frame in config.frames)
 
     def read(content: Any, place: str) -> Any:
-        if wanted != frames_of(content)[: len(wanted)]:
-            return None
-        if twist:
-            value = twist_in_plane(TWISTS[topic.kind](content))
-            if not np.isfinite(value).all():
-                raise InputError(place, f"the velocities are {', '.join(map(str, value))}", "finite numbers")
+        value = value_of(config, topic.kind, content, place)
+        if twist or value is None:
             return value
         position, turn = POSES[topic.kind](content)
-        value = pose_in_plane(position, turn, place, config.plane)
         points.append(position)
         found = list[str]()  # doubtful, and can be read
         if abs(np.hypot(np.hypot(*turn[:2]), np.hypot(*turn[2:])) - 1) > 0.01:
@@ -313,7 +330,8 @@ def read_poses(bag: Bag, config: PoseTopic, role: str = "truth") -> Series:
             rows.append((number, *stamps, frames_of(content), time))
             kept.append(value)
     if not rows:
-        raise InputError(where, f"no message of the frames {wanted}", "one at least", "`doctor` lists them")
+        found = f"no message of the frames {', '.join(config.frames)}"
+        raise InputError(where, found, "one at least", "`doctor` lists them")
     numbers, times, others, pairs, _ = ([row[k] for row in rows] for k in range(5))
     values = np.array(kept).reshape(-1, 3)
     poses = values * (0.0 if twist else 1.0)  # velocities of several nodes do not contradict each other

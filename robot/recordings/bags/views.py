@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robot.recordings.alignment import range_errors, range_pixels
-from robot.recordings.bags.bag import Bag, Series, Topic, as_series
+from robot.recordings.bags.bag import Bag, Messages, Series, Topic, as_series
 from robot.recordings.bags.topics_config import ViewsTopic
 from robot.recordings.bags.transforms import FORWARD, Mount, mount_of
 from robot.recordings.video import Frame, ImageViewConfig, VisualOdometryConfig, camera_rows
@@ -106,7 +106,7 @@ def _decoded(message: Any, where: str) -> np.ndarray:
 
 SCAN, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
 _RING_BEAMS = 360  # of a cloud: the nearest point of each degree
-_COVERED = 0.5
+COVERED = 0.5
 """Share of the sectors in which a view has beams, at least."""
 
 
@@ -164,7 +164,7 @@ def extent_of(message: Any, where: str) -> Extent:
 
 def wider_extent(extents: Sequence[Extent]) -> Extent | None:
     """What scans cover together, in the order of the first; None if that is no more than the first covers, or
-    if most scans cover less than `_COVERED` of it."""
+    if most scans cover less than `COVERED` of it."""
     first = extents[0]
     if first.ring:
         return None
@@ -172,7 +172,7 @@ def wider_extent(extents: Sequence[Extent]) -> Extent | None:
     middle, half = _wrapped(middle - first.middle), np.abs(width) / 2
     low, high = float((middle - half).min()), float((middle + half).max())
     whole = 2 * np.pi if any(extent.ring for extent in extents) else min(high - low, 2 * np.pi)
-    if whole <= abs(first.width) + 2 * first.step or np.median(np.abs(width)) < _COVERED * whole:
+    if whole <= abs(first.width) + 2 * first.step or np.median(np.abs(width)) < COVERED * whole:
         return None
     return Extent(first.middle + (low + high) / 2, float(np.copysign(whole, first.width)), float(step.max()))
 
@@ -327,9 +327,9 @@ def read_range_views(bag: Bag, config: ViewsTopic, body: str) -> Series:
     """
     topic = bag.topic(config.topic, KEY, (SCAN, CLOUD, *IMAGES))
     where = f"{bag.path}, {topic.name}"
-    reader = _RangeReader(bag, topic, config, body)
+    reader = RangeReader(bag, topic.kind, config, body)
     read = list(bag.stamped(topic, reader.view))
-    rows = [row for row in read if row[2] is not None and row[2].covered >= _COVERED]
+    rows = [row for row in read if row[2] is not None and row[2].covered >= COVERED]
     empty = sum(view is None for *_, view in read)
     few = len(read) - len(rows) - empty
     for count, fault in ((empty, "have no measured range"), (few, "cover less than half of the sectors")):
@@ -379,15 +379,18 @@ def read_image_views(
     return views, None if motion is None else motion[np.isin(numbers, views.numbers)]
 
 
-class _RangeReader:
+class RangeReader:
     """Views of the messages of a topic; what the settings leave open is as in the first message.
+
+    Args:
+        bag: of the transforms. kind: type of the messages. body: frame of the robot; '' if unknown.
 
     Attributes:
         reach: range that becomes 1, m.
     """
 
-    def __init__(self, bag: Bag, topic: Topic, config: ViewsTopic, body: str) -> None:
-        self._bag, self._topic, self._config, self._body = bag, topic, config, body
+    def __init__(self, bag: Messages, kind: str, config: ViewsTopic, body: str) -> None:
+        self._bag, self._kind, self._config, self._body = bag, kind, config, body
         self.reach = config.max_range
         self._mounts = dict[str, Mount]()
         self._first = ""  # frame of the first scan
@@ -397,10 +400,10 @@ class _RangeReader:
     def view(self, content: Any, place: str) -> RangeView | None:
         """As `scan_view` and `cloud_view`."""
         config, sensor = self._config, content.header.frame_id
-        longest = scan_limits(content)[1] if self._topic.kind == SCAN else LONGEST
+        longest = scan_limits(content)[1] if self._kind == SCAN else LONGEST
         reach = self.reach or min(longest, LONGEST)
         pixels = config.rows * config.columns
-        if self._topic.kind == CLOUD:
+        if self._kind == CLOUD:
             view = cloud_view(content, self._mount(sensor), config.heights, pixels, reach, place)
         else:
             own, first = extent_of(content, place), sensor if self._shared is None else self._first

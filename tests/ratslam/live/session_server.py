@@ -100,7 +100,7 @@ def result_of(number: int, seconds: float) -> Any:
 
     from ratslam.live.mapper_process import MappedSample
 
-    return MappedSample(number, np.zeros(3), -1, seconds, np.nan, False, np.zeros((0, 2)))
+    return MappedSample(number, np.zeros(3), -1, seconds, np.nan, False, np.zeros((0, 2)), np.zeros(3))
 
 
 def map_nothing(directory: str, seconds: float, line: Connection) -> None:

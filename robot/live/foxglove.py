@@ -1,0 +1,277 @@
+"""A client of the Foxglove WebSocket protocol: topics of a robot on which `foxglove_bridge` runs.
+
+The server advertises its topics with the definitions of their messages; the client subscribes to some of them
+and gets each message as the robot published it (CDR of ROS 2, or the format of ROS 1). The client can publish
+too, if the server allows it. A thread reads; a connection that is lost is made again until the client is
+closed. Protocol: https://github.com/foxglove/ws-protocol (`foxglove.websocket.v1`), whose messages bridges
+from version 3 on (`foxglove.sdk.v1`) send too.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import ssl
+import struct
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from typing import Any, NamedTuple
+
+from tactile.base.errors import InputError
+
+SUBPROTOCOLS: tuple[Any, ...] = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+LARGEST = 1 << 26
+"""Largest message that is accepted, bytes."""
+WAITING = 4096
+"""Messages that may wait to be taken; then the client reads no further."""
+MOST_TOPICS = 10_000
+"""Topics of a server of which more are ignored."""
+RETRY, LONGEST_RETRY = 0.1, 2.0
+"""Waiting time before a lost connection is made again, at first and at most, s."""
+CONNECT_TIMEOUT = 5.0
+"""Time limit of making a connection, s."""
+START = "on the robot: `ros2 launch foxglove_bridge foxglove_bridge_launch.xml`"
+_MESSAGE = struct.Struct("<BIQ")  # opcode, subscription, time of the server in ns
+
+
+class Channel(NamedTuple):
+    """A topic as it is advertised.
+
+    Attributes:
+        number: of the server's. topic: its name. encoding: of its messages, `cdr` or `ros1`. kind: type of
+            its messages, such as nav_msgs/msg/Odometry. definition: of the type, as text.
+        notation: of the definition: ros2msg, ros2idl or ros1msg.
+    """
+
+    number: int
+    topic: str
+    encoding: str
+    kind: str
+    definition: str
+    notation: str
+
+
+class Received(NamedTuple):
+    """A message. Attributes: time: of its arrival, ns since 1970."""
+
+    channel: Channel
+    time: int
+    content: bytes
+
+
+class Notice(NamedTuple):
+    """What happened to the connection. Attributes: name: `lost`, `back`, `vanished` (a topic) or `garbage`.
+    time: ns since 1970."""
+
+    name: str
+    time: int
+    text: str
+
+
+class FoxgloveClient:
+    """A connection to a server, made again whenever it is lost.
+
+    Args:
+        address: `ws://HOST:PORT` or `wss://HOST:PORT`. wanted: whether a topic is to be subscribed to; it may
+            be changed by `want`.
+
+    Attributes:
+        channels: topics that the server advertises, by name; the first of several with one name.
+            doubled: names that several channels have. name: of the server. accepts: encodings that the
+            server accepts from clients, empty if none may publish.
+
+    Raises:
+        InputError: nothing answers at the address, or it is another server.
+    """
+
+    def __init__(self, address: str, wanted: Callable[[Channel], bool]) -> None:
+        self.address, self._wanted = address, wanted
+        self.channels: dict[str, Channel] = {}
+        self.doubled: set[str] = set()
+        self.name, self.accepts = "", tuple[str, ...]()
+        self._all: dict[int, Channel] = {}
+        self._subscribed: dict[int, Channel] = {}  # by the number of the subscription, that of the channel
+        self._published: dict[str, int] = {}
+        self._taken: queue.Queue[Received | Notice] = queue.Queue(WAITING)
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        self._socket, self._stack = _connect(address)
+        self._thread = threading.Thread(target=self._read_on, daemon=True, name=f"topics of {address}")
+        self._thread.start()
+
+    def want(self, wanted: Callable[[Channel], bool]) -> None:
+        """Subscribes to other topics, besides those that are subscribed to already."""
+        self._wanted = wanted
+        self._subscribe()
+
+    def take(self, longest: float) -> list[Received | Notice]:
+        """What came since the last call, in its order; waits up to `longest` s for the first."""
+        found = list[Received | Notice]()
+        with suppress(queue.Empty):
+            found.append(self._taken.get(timeout=longest))
+            while True:
+                found.append(self._taken.get_nowait())
+        return found
+
+    def publish(self, topic: str, kind: str, content: bytes) -> None:
+        """Sends a message in CDR to a topic; does nothing while there is no connection, or if the server does
+        not accept messages."""
+        if "cdr" not in self.accepts:
+            return
+        with self._lock, suppress(OSError, _closed_errors()):
+            if topic not in self._published:
+                self._published[topic] = len(self._published) + 1
+                channel = {
+                    "id": self._published[topic],
+                    "topic": topic,
+                    "encoding": "cdr",
+                    "schemaName": kind,
+                }
+                self._socket.send(json.dumps({"op": "advertise", "channels": [channel]}))
+            self._socket.send(struct.pack("<BI", 1, self._published[topic]) + content)
+
+    def close(self) -> None:
+        """Ends the connection."""
+        self._closed.set()
+        with suppress(OSError, _closed_errors()):
+            self._stack.close()
+        while self._thread.is_alive():
+            self.take(0.05)  # the thread may wait for room
+
+    def _read_on(self) -> None:
+        """Reads the connection, and makes a new one when it is lost, until the client is closed."""
+        while not self._closed.is_set():
+            why = "closed by the robot's side"
+            try:
+                for message in self._socket:
+                    self._receive(message, time.time_ns())
+            except (OSError, _closed_errors()) as error:
+                why = " ".join(str(error).split()) or type(error).__name__
+            if self._closed.is_set():
+                return
+            self._note("lost", why)
+            self._all, self.channels, self._subscribed, self._published = {}, {}, {}, {}
+            self._reconnect()
+
+    def _reconnect(self) -> None:
+        wait = RETRY
+        while not self._closed.wait(wait):
+            wait = min(2 * wait, LONGEST_RETRY)
+            with suppress(InputError):
+                self._socket, self._stack = _connect(self.address)
+                self._note("back", "connected again")
+                return
+
+    def _note(self, name: str, text: str) -> None:
+        self._put(Notice(name, time.time_ns(), text))
+
+    def _put(self, item: Received | Notice) -> None:
+        while not self._closed.is_set():
+            with suppress(queue.Full):
+                self._taken.put(item, timeout=0.1)
+                return
+
+    def _receive(self, message: str | bytes, now: int) -> None:
+        try:
+            if isinstance(message, str):
+                self._obey(json.loads(message))
+            elif message[:1] == b"\x01":
+                _, subscription, _ = _MESSAGE.unpack_from(message)
+                channel = self._subscribed.get(subscription)
+                if channel is not None:
+                    self._put(Received(channel, now, message[_MESSAGE.size :]))
+        except (ValueError, KeyError, TypeError, AttributeError, struct.error, RecursionError) as error:
+            self._note("garbage", f"{len(message)} bytes that are no message of the protocol ({error!r})")
+
+    def _obey(self, content: dict[str, Any]) -> None:
+        """Does what a message of the server in JSON says."""
+        kind = content.get("op")
+        if kind == "serverInfo":
+            self.name = str(content.get("name", ""))
+            able = "clientPublish" in content.get("capabilities", [])
+            self.accepts = tuple(map(str, content.get("supportedEncodings", ["cdr"]))) if able else ()
+        elif kind == "advertise":
+            for each in content["channels"]:
+                if len(self._all) < MOST_TOPICS:
+                    channel = _channel_of(each)
+                    self._all[channel.number] = channel
+            self._list_channels()
+            self._subscribe()
+        elif kind == "unadvertise":
+            for number in content["channelIds"]:
+                gone = self._all.pop(int(number), None)
+                if gone is not None and self._subscribed.pop(gone.number, None) is not None:
+                    self._note("vanished", f"{gone.topic} is no longer advertised")
+            self._list_channels()
+        elif kind == "status" and int(content.get("level", 0)) >= 2:
+            self._note("garbage", f"the robot's side reports: {content.get('message', '')}")
+
+    def _list_channels(self) -> None:
+        found = dict[str, Channel]()
+        self.doubled = set()
+        for channel in list(self._all.values()):
+            if channel.topic in found:
+                self.doubled.add(channel.topic)
+            found.setdefault(channel.topic, channel)
+        self.channels = found
+
+    def _subscribe(self) -> None:
+        new = [each for number, each in list(self._all.items()) if number not in self._subscribed]
+        taken = {each.topic for each in self._subscribed.values()}
+        wanted = [each for each in reversed(new) if each.topic not in taken and self._wanted(each)]
+        chosen = {each.number: each for each in {each.topic: each for each in wanted}.values()}
+        if not chosen:
+            return
+        self._subscribed |= chosen
+        asked = [{"id": number, "channelId": number} for number in chosen]
+        with suppress(OSError, _closed_errors()):
+            self._socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+
+
+def _channel_of(each: dict[str, Any]) -> Channel:
+    """The channel of an advertisement; names of types as in ROS 2."""
+    kind = str(each["schemaName"])
+    if kind.count("/") == 1:
+        kind = kind.replace("/", "/msg/")
+    encoding = str(each["encoding"])
+    notation = str(each.get("schemaEncoding") or ("ros1msg" if encoding == "ros1" else "ros2msg"))
+    texts = str(each["topic"]), encoding, kind, str(each.get("schema", "")), notation
+    return Channel(int(each["id"]), *texts)
+
+
+def _closed_errors() -> type[Exception]:
+    """What websockets raises for a connection that has ended."""
+    from websockets.exceptions import WebSocketException
+
+    return WebSocketException
+
+
+def _connect(address: str) -> tuple[Any, ExitStack]:
+    """A new connection, and the stack that closes it."""
+    try:
+        from websockets.exceptions import InvalidURI, NegotiationError, WebSocketException
+        from websockets.sync.client import connect
+    except ImportError:
+        raise InputError("websockets", "not installed", "", "pip install 'ratslam[live-ros]'") from None
+    expected = "the address of a Foxglove bridge, ws://HOST:8765 or wss://HOST:8765"
+    stack = ExitStack()
+    try:
+        opened = connect(
+            address, subprotocols=SUBPROTOCOLS, compression=None, proxy=None, max_size=LARGEST,
+            open_timeout=CONNECT_TIMEOUT, close_timeout=1.0, ping_interval=5.0, ping_timeout=10.0,
+        )  # fmt: skip
+        socket = stack.enter_context(opened)
+    except InvalidURI:
+        raise InputError(address, "no address of a websocket", expected) from None
+    except ssl.SSLError as error:
+        cure = "the certificate must be valid for this name, or its issuer's be given in SSL_CERT_FILE"
+        raise InputError(address, f"no trusted connection ({error})", expected, cure) from None
+    except (OSError, NegotiationError, WebSocketException, TimeoutError) as error:
+        words = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(address, f"no connection ({words})", expected, START) from None
+    if socket.subprotocol not in SUBPROTOCOLS:
+        stack.close()
+        raise InputError(address, "another server than a Foxglove bridge", expected, START)
+    return socket, stack

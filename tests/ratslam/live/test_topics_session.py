@@ -1,0 +1,220 @@
+"""A robot in a room, mapped over its topics: the configuration is written, the session is that of the file
+and of its own recording, to the bit, and the map goes back to the robot."""
+
+import json
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ratslam.cli import main
+from tests.helpers.commands import refused, said, start
+from tests.helpers.ros_bags import ROS2, Entry, odometry, scan, write_bag
+from tests.helpers.stand_in_robot import PlainBridge, SdkBridge
+
+KINDS = {
+    "/odom": "nav_msgs/msg/Odometry",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/imu": "sensor_msgs/msg/Imu",
+}
+START = 1_700_000_000_000_000_000
+WALLS = np.array(
+    [
+        (-1.5, -1.2, 5.5, -1.2), (5.5, -1.2, 5.5, 4.2), (5.5, 4.2, -1.5, 4.2), (-1.5, 4.2, -1.5, -1.2),
+        (1.2, 1.0, 2.9, 1.0), (2.9, 1.0, 2.9, 1.9), (2.9, 1.9, 1.2, 1.9), (1.2, 1.9, 1.2, 1.0),
+        (4.7, -0.3, 5.1, 0.4), (-1.1, 3.2, -0.6, 3.9), (0.4, 3.7, 1.3, 4.1),
+    ]
+)  # fmt: skip
+PATIENCE = 120.0
+SAME = ("trajectory.tum", "online.tum", "steps.csv", "closures.csv", "odometry.tum")
+
+
+def ranges(pose, angles):
+    """Distances to the walls, m."""
+    ray = np.stack([np.cos(angles + pose[2]), np.sin(angles + pose[2])], 1)[:, None]
+    begin, edge = WALLS[None, :, :2] - pose[:2], (WALLS[:, 2:] - WALLS[:, :2])[None]
+    with np.errstate(all="ignore"):
+        cross = ray[..., 0] * edge[..., 1] - ray[..., 1] * edge[..., 0]
+        away = (begin[..., 0] * edge[..., 1] - begin[..., 1] * edge[..., 0]) / cross
+        along = (begin[..., 0] * ray[..., 1] - begin[..., 1] * ray[..., 0]) / cross
+    return np.where((away > 0) & (along >= 0) & (along <= 1), away, 30.0).min(1)
+
+
+def rounds(count: float) -> list[Entry]:
+    """Messages of a robot that drives rectangles of 4 m x 3 m: drifting odometry at 50 Hz, scans at 10."""
+    sides = [4.0, 3.0, 4.0, 3.0] * 4
+    pose, drifted, found, step = np.zeros(3), np.zeros(3), list[Entry](), 0
+    for side in sides[: round(4 * count)]:
+        for turn, steps in ((0.0, round(side / 0.4 * 50)), (np.pi / 2, round(np.pi / 2 / 0.7 * 50))):
+            for _ in range(steps):
+                ahead = side / steps if not turn else 0.0
+                for each, scale, bias in ((pose, 1.0, 0.0), (drifted, 1.02, 0.02)):
+                    each += [scale * ahead * np.cos(each[2]), scale * ahead * np.sin(each[2]), 0.0]
+                    each[2] += (turn / steps if turn else 0.0) + bias * ahead
+                at = START + step * 20_000_000
+                x, y, heading = drifted.tolist()
+                found.append(odometry(at, x, y, float(np.arctan2(np.sin(heading), np.cos(heading)))))
+                if step % 5 == 2:
+                    angles = -np.pi + np.arange(120) * np.pi / 60
+                    found.append(scan(at + 7_000_000, ranges(pose, angles), -np.pi, np.pi / 60))
+                step += 1
+    return sorted(found, key=lambda entry: entry.time)
+
+
+class Player:
+    """Plays messages to a bridge from a thread, at a multiple of their speed; again and again until `done`,
+    if `endless`."""
+
+    def __init__(self, bridge, entries: list[Entry], speed: float, endless: bool = False) -> None:
+        self._bridge, self._entries, self._speed, self._endless = bridge, entries, speed, endless
+        self.done = threading.Event()
+        self._thread = threading.Thread(target=self._play, daemon=True)
+        self._thread.start()
+
+    def _play(self) -> None:
+        while True:
+            self._play_once()
+            if not self._endless or self.done.is_set():
+                break
+        self.done.set()
+
+    def _play_once(self) -> None:
+        began, first = time.monotonic(), self._entries[0].time
+        for entry in self._entries:
+            due = began + (entry.time - first) / 1e9 / self._speed
+            time.sleep(max(due - time.monotonic(), 0.0))
+            self._bridge.send(entry)
+            if self._endless and self.done.is_set():
+                return
+
+
+def session(bridge, config: Path, folder: Path, entries: list[Entry], speed: float, *more: str) -> dict:
+    """Runs a session while messages are played, ends it with Ctrl-C, and returns its report."""
+    process = start(
+        "live", config, "-o", folder, "--set", "live.topics.max_wait=30", "--set", "live.budget=60", *more
+    )
+    try:
+        due = time.monotonic() + PATIENCE
+        while not (folder / "session.mcap").exists():
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < due
+            time.sleep(0.05)
+        time.sleep(0.3)
+        player = Player(bridge, entries, speed)
+        assert player.done.wait(PATIENCE + len(entries) / 50)
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
+    assert process.returncode == 130, told
+    assert "Traceback" not in told
+    return json.loads((folder / "live.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("count", "speed"),
+    [(1.3, 10.0), pytest.param(2.0, 1.0, marks=pytest.mark.soak)],
+    ids=["fast", "real_time"],
+)
+def test_the_map_of_a_session_is_that_of_the_file_and_of_its_recording(
+    count, speed, loopback, tmp_path, capsys
+):
+    entries, robot = rounds(count), PlainBridge(loopback, KINDS)
+    config = tmp_path / "robot.yaml"
+    try:
+        player = Player(robot, rounds(0.2), 1.0, endless=True)
+        text = said(capsys, "topics", robot.address, "-o", config, "--seconds", "2")
+        assert "/scan" in text
+        assert "serves as" in text
+        assert f"python -m ratslam live {config}" in text
+        player.done.set()
+        report = session(
+            robot, config, tmp_path / "live", entries, speed, "--set", "live.topics.publish=true"
+        )
+        published = {topic for topic, _, _ in robot.published}
+    finally:
+        robot.close()
+    scans = sum(entry.topic == "/scan" for entry in entries)
+    assert report["messages"] == {"/odom": len(entries) - scans, "/scan": scans}
+    assert report["dropped"] == {}
+    assert report["views"] >= scans - 1
+    assert published == {"/ratslam/pose", "/ratslam/path", "/tf", "/diagnostics"}
+    pose = next(content for topic, _, content in reversed(robot.published) if topic == "/ratslam/pose")
+    ROS2.deserialize_cdr(pose, "geometry_msgs/msg/PoseWithCovarianceStamped")
+    link = next(content for topic, _, content in reversed(robot.published) if topic == "/tf")
+    (moved,) = ROS2.deserialize_cdr(link, "tf2_msgs/msg/TFMessage").transforms
+    assert (moved.header.frame_id, moved.child_frame_id) == ("map", "odom")
+    assert main(["run", str(tmp_path / "live" / "config.yaml"), "-o", str(tmp_path / "again")]) == 0
+    for name in SAME:
+        assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+    (tmp_path / "bag").mkdir()
+    bag = write_bag(tmp_path / "bag", "mcap", entries)
+    settings = ["live=null", f"recording.file={bag}", "session.reserve=8208"]
+    assigned = [word for setting in settings for word in ("--set", setting)]
+    assert main(["run", str(config), "-o", str(tmp_path / "file"), *assigned]) == 0
+    for name in ("online.tum", "steps.csv"):
+        mapped, whole = ((tmp_path / run / name).read_bytes() for run in ("live", "file"))
+        assert whole.startswith(mapped[: mapped.rfind(b"\n", 0, -1)]), name
+    closures = (tmp_path / "again" / "closures.csv").read_text().splitlines()
+    assert len(closures) > 1  # the second round is recognised
+
+
+@pytest.mark.soak
+def test_a_session_goes_on_with_a_map_and_localises_in_one(loopback, tmp_path):
+    entries, robot = rounds(1.2), SdkBridge(loopback, KINDS)
+    config = tmp_path / "robot.yaml"
+    config.write_text(
+        f"live: {{topics: {{source: '{robot.address}'}}}}\n"
+        "recording: {topics: {odometry: /odom, views: {topic: /scan, max_range: 8.0}, samples: views}}\n"
+        "pose_cells: {cells_xy: 61, cell_size: 0.62}\nrecall: {sector_fov: 6.2832}\n"
+    )
+    try:
+        first = session(robot, config, tmp_path / "first", entries, 20.0)
+        on = session(robot, config, tmp_path / "on", entries, 20.0, "--continue", str(tmp_path / "first"))
+        there = session(
+            robot, config, tmp_path / "there", entries, 20.0, "--localise", str(tmp_path / "first")
+        )
+    finally:
+        robot.close()
+    assert first["views"] == on["views"] == there["views"]
+    again = ["run", str(tmp_path / "on" / "config.yaml"), "-o", str(tmp_path / "again")]
+    assert main([*again, "--continue", str(tmp_path / "first")]) == 0
+    for name in SAME:
+        assert (tmp_path / "on" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+    steps = (tmp_path / "there" / "steps.csv").read_text().splitlines()
+    assert len(steps) == there["views"] + 1
+
+
+def test_what_cannot_be_mapped_is_refused_before_a_session(loopback, tmp_path, capsys):
+    robot, config = PlainBridge(loopback, KINDS), tmp_path / "robot.yaml"
+    other = robot.address.rsplit(":", 1)[0] + ":9"
+    assert "no connection" in refused(capsys, "topics", other, "-o", config)
+    assert not config.exists()
+    live = f"live: {{topics: {{source: '{robot.address}'}}}}\n"
+    cases = {
+        "recording.topics: missing": live,
+        "no topic '/odo'; expected it among '/imu', '/odom', '/scan'; did you mean '/odom'?": live
+        + "recording: {topics: {odometry: /odo, views: /scan, samples: views}}\n",
+        "messages of type sensor_msgs/msg/Imu": live
+        + "recording: {topics: {odometry: /odom, views: /imu, samples: views}}\n",
+        "--set recording.topics.samples=views": live
+        + "recording: {topics: {odometry: /odom, views: /scan}}\n",
+        "topics and create": "live: {create: {}, topics: {source: 'ws://x:1'}}\n",
+        "recording.file is missing": "recording: {topics: {odometry: /odom}}\n",
+    }
+    try:
+        for expected, text in cases.items():
+            config.write_text(text)
+            assert expected in refused(capsys, "live", config, "-o", tmp_path / "run"), text
+            assert not (tmp_path / "run").exists()
+        config.write_text(live + "recording: {topics: {odometry: /odom, views: /scan, samples: views}}\n")
+        assert "a live session" in refused(capsys, "run", config, "-o", tmp_path / "run")
+        player = Player(robot, rounds(0.2), 1.0, endless=True)
+        assert "can start" in said(capsys, "doctor", "--live", config)
+        player.done.set()
+    finally:
+        robot.close()
