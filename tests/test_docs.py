@@ -52,7 +52,8 @@ def name(path):
 COMMANDS = [command for path in READMES for command in commands(path)]
 MARKED = {
     "robot": (
-        "live ", "emulate ", "robot.emulators", "doctor --live", "run runs/", "run square -o runs/shown",
+        "live ", "topics ", "emulate ", "robot.emulators", "doctor --live", "run runs/",
+        "run square -o runs/shown",
     ),
     "data": (
         "doctor ", "fit ", "run mine", "run tuesday", "localise runs/monday", "merge runs/monday",

@@ -153,16 +153,13 @@ class FoxgloveClient:
                 return
             self._note("lost", why)
             self._all, self.channels, self._subscribed, self._published = {}, {}, {}, {}
-            self._reconnect()
-
-    def _reconnect(self) -> None:
-        wait = RETRY
-        while not self._closed.wait(wait):
-            wait = min(2 * wait, LONGEST_RETRY)
-            with suppress(InputError):
-                self._socket, self._stack = _connect(self.address)
-                self._note("back", "connected again")
-                return
+            wait = RETRY
+            while not self._closed.wait(wait):
+                wait = min(2 * wait, LONGEST_RETRY)
+                with suppress(InputError):
+                    self._socket, self._stack = _connect(self.address)
+                    self._note("back", "connected again")
+                    break
 
     def _note(self, name: str, text: str) -> None:
         self._put(Notice(name, time.time_ns(), text))

@@ -69,7 +69,9 @@ class MapPublisher:
 
     def publish(self, state: PoseReport, drawing: Drawing | None) -> None:
         """Publishes the present state, and the map where it is known."""
-        header = self._header(state.time, MAP)
+        ns = round(state.time * 1e9)
+        stamp = self._make("builtin_interfaces/msg/Time", sec=ns // 10**9, nanosec=ns % 10**9)
+        header = self._make("std_msgs/msg/Header", stamp=stamp, frame_id=MAP)
         variance = np.where(np.isfinite(state.spread), state.spread**2, 0.0)
         covariance = np.zeros(36)
         covariance[[0, 7, 35]] = variance
@@ -116,11 +118,6 @@ class MapPublisher:
         self._send(
             "/ratslam/grid", "nav_msgs/msg/OccupancyGrid", header=header, info=about, data=cells.ravel()
         )
-
-    def _header(self, seconds: float, frame: str) -> Any:
-        ns = round(seconds * 1e9)
-        stamp = self._make("builtin_interfaces/msg/Time", sec=ns // 10**9, nanosec=ns % 10**9)
-        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
     def _pose(self, pose: np.ndarray) -> Any:
         x, y, heading = (float(value) for value in pose)

@@ -78,7 +78,12 @@ class LiveMessages(Messages):
     def list_topics(self, channels: dict[str, Channel]) -> None:
         """Sets the topics to those that the robot advertises."""
         for channel in channels.values():
-            self._learn(channel)
+            if channel.encoding == "ros1" and "ros1" not in self._stores:
+                from rosbags.typesys import Stores, get_typestore
+
+                self._stores["ros1"] = get_typestore(Stores.ROS1_NOETIC)
+            for store in self._stores.values() if channel.notation != "ros2idl" else ():
+                learn_type(store, channel.kind, channel.definition)
         # That messages come is awaited, not asked.
         self.topics = {name: Topic(name, channel.kind, 1) for name, channel in sorted(channels.items())}
 
@@ -130,15 +135,6 @@ class LiveMessages(Messages):
     def usable(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any, Any]]:
         for number, time, content in self._kept.get(topic.name, []):
             yield number, time, content, read(content, f"{self.path}, {topic.name}, message {number}")
-
-    def _learn(self, channel: Channel) -> None:
-        if channel.encoding == "ros1" and "ros1" not in self._stores:
-            from rosbags.typesys import Stores, get_typestore
-
-            self._stores["ros1"] = get_typestore(Stores.ROS1_NOETIC)
-        if channel.notation != "ros2idl":
-            for store in self._stores.values():
-                learn_type(store, channel.kind, channel.definition)
 
     def _damage(self, channel: Channel, content: bytes, error: Exception) -> InputError:
         words = " ".join(str(error).split())[:200] or type(error).__name__

@@ -143,31 +143,20 @@ class TopicsRig(PolledRig):
     def check(self) -> Iterator[str]:
         """Waits for a message of each topic; yields a line of text with the age of its stamp."""
         for name in sorted(self.steps.topics):
-
-            def came(name: str = name) -> bool:
-                return name in self._heard
-
-            if came() or self._comes(came):
-                yield f"{name}: messages come{self._age(name)}"
+            due = time.monotonic() + FIRST
+            while name not in self._heard and time.monotonic() < due:
+                self.poll()
+                time.sleep(TICK)
+            if name in self._heard:
+                age, said = self._ages.get(name), f"{name}: messages come"
+                if age is not None:
+                    said += f", stamped {age * 1e3:.0f} ms before their arrival"
+                if age is not None and abs(age) > 1.0:
+                    said += ": the clocks of robot and host differ, which does no harm to the map"
+                yield said
             else:
                 wait = f"the session waits {self.topics.patience:g} s for it"
                 yield f"{name}: no message in {FIRST:g} s; {wait}"
-
-    def _comes(self, came: Callable[[], bool]) -> bool:
-        due = time.monotonic() + FIRST
-        while not came() and time.monotonic() < due:
-            self.poll()
-            time.sleep(TICK)
-        return came()
-
-    def _age(self, name: str) -> str:
-        age = self._ages.get(name)
-        if age is None:
-            return ""
-        said = f", stamped {age * 1e3:.0f} ms before their arrival"
-        if abs(age) > 1.0:
-            said += ": the clocks of robot and host differ, which does no harm to the map"
-        return said
 
     def poll(self) -> None:
         """Takes what came before the session: transforms are kept, the rest is not used."""

@@ -14,6 +14,23 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 for store in (ROS1, ROS2):
     store.register(get_types_from_msg("float32 energy\nstring note", "lab_msgs/msg/Custom"))
+CREATE = {
+    "irobot_create_msgs/msg/HazardDetection": "uint8 BUMP=1\nuint8 CLIFF=2\nstd_msgs/Header header\nuint8 type",
+    "irobot_create_msgs/msg/HazardDetectionVector": (
+        "std_msgs/Header header\nirobot_create_msgs/HazardDetection[] detections"
+    ),
+    "irobot_create_msgs/msg/IrIntensity": "std_msgs/Header header\nint16 value",
+    "irobot_create_msgs/msg/IrIntensityVector": (
+        "std_msgs/Header header\nirobot_create_msgs/IrIntensity[] readings"
+    ),
+    "create_msgs/msg/Bumper": (
+        "std_msgs/Header header\nbool is_left_pressed\nbool is_right_pressed\nuint16 light_signal_left"
+    ),
+}
+"""Messages of a Create, which ROS itself does not define."""
+for kind, text in CREATE.items():
+    for store in (ROS1, ROS2):
+        store.register(get_types_from_msg(text, kind))
 for early in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
     ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", early))
 

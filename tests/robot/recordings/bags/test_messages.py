@@ -278,3 +278,58 @@ def test_suggested_settings_read_the_bag(parts, expected, write):
     assert topics == expected
     if topics:
         assert len(opened(path, **topics).time) >= 20
+
+
+def bumper(time, *frames):
+    detections = [{"header": header(time, frame), "type": 1} for frame in frames]
+    fields = {"header": header(time), "detections": detections}
+    return Entry("/hazards", "irobot_create_msgs/msg/HazardDetectionVector", time, fields)
+
+
+def test_hazards_proximity_and_bumpers_of_a_create_are_touch_by_the_names_of_their_sensors(write):
+    pressed = {
+        3: ("bump_left",),
+        5: ("bump_right", "cliff_side_left"),
+        7: ("bump_front_center", "bump_right"),
+    }
+    hazards = [bumper(time, *pressed.get(row, ())) for row, time in enumerate(TIMES)]
+    found = [
+        sample.reading.view.ravel().tolist() for sample in opened(write(WHEELS, hazards), touch="/hazards")
+    ]
+    assert {row: view for row, view in enumerate(found) if any(view)} == {
+        3: [1.0, 0.0, 0.0, 0.0, 0.0], 5: [0.0, 0.0, 0.0, 0.0, 1.0], 7: [0.0, 0.0, 1.0, 0.0, 1.0],
+    }  # fmt: skip
+    cliffs = {"topic": "/hazards", "joints": ["cliff_side_left"]}
+    assert [sample.reading.view.sum() for sample in opened(write(WHEELS, hazards), touch=cliffs)] == [
+        float(row == 5) for row in range(12)
+    ]
+    readings = [
+        {"header": header(0, f"ir_intensity_{side}"), "value": value}
+        for side, value in (("left", 400), ("right", 100))
+    ]
+    infrared = "irobot_create_msgs/msg/IrIntensityVector"
+    ir = [Entry("/ir", infrared, time, {"header": header(time), "readings": readings}) for time in TIMES]
+    view = next(iter(opened(write(WHEELS, ir), touch={"topic": "/ir", "high": 1000.0}))).reading.view
+    assert view.ravel().tolist() == [0.4, 0.1]
+    parts = [
+        Entry(
+            "/bumper", "create_msgs/msg/Bumper", time, {"header": header(time), "is_right_pressed": row == 4}
+        )
+        for row, time in enumerate(TIMES)
+    ]
+    found = [sample.reading.view.ravel().tolist() for sample in opened(write(WHEELS, parts), touch="/bumper")]
+    assert [row for row, view in enumerate(found) if view == [0.0, 1.0]] == [4]
+    with pytest.raises(InputError, match="no sensor 'is_pressed'; expected one of is_left_pressed"):
+        opened(write(WHEELS, parts), touch={"topic": "/bumper", "joints": ["is_pressed"]})
+    (topic,) = (each for each in describe_bag(write(WHEELS, hazards)).topics if each.name == "/hazards")
+    assert topic.roles == ("touch",)
+    assert topic.shape.size == (5,)
+
+
+def test_a_mount_that_is_repeated_on_tf_is_its_first_transform(write):
+    rings = [scan(time, 1 + np.arange(72) % 7, -np.pi, np.pi / 36) for time in TIMES]
+    once = opened(write(WHEELS, rings, [link("base_link", "laser", 1.0)]), views="/scan")
+    repeated = [entry for time in TIMES for entry in framed("base_link", "laser", [(0.0, 0.0, 1.0)], [time])]
+    again = opened(write(WHEELS, rings, repeated), views="/scan")
+    views = [[sample.reading.view.tobytes() for sample in each] for each in (once, again)]
+    assert views[0] == views[1]
