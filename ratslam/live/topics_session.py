@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -76,8 +77,8 @@ class TopicsSession(LiveRobot):
         publisher = MapPublisher(self.rig.client) if self.rig.topics.publish else None
         sent = deque[tuple[int, float, np.ndarray | None]](maxlen=KEPT)
 
-        def count(time: float, odometry: np.ndarray | None) -> None:
-            sent.append((self.count, time, odometry))
+        def count(moment: float, odometry: np.ndarray | None) -> None:
+            sent.append((self.count, moment, odometry))
             self.count += 1
             if publisher is not None and publisher.due():
                 _publish(publisher, mapper, sent)
@@ -87,8 +88,9 @@ class TopicsSession(LiveRobot):
         run_topics_loop(self.rig, mapper, count)
 
     def report(self) -> dict[str, Any]:
-        rig = self.rig
+        rig, now = self.rig, (time.process_time(), time.monotonic())
         return {
+            "cpu": (now[0] - rig.began[0]) / max(now[1] - rig.began[1], 1e-9),
             "messages": dict(rig.messages.counts),
             "unusable": dict(rig.spoilt),
             "dropped": dict(rig.steps.dropped),
@@ -106,11 +108,11 @@ def _publish(
     if not mapper.mapped:
         return
     newest, drawing = mapper.mapped[-1], mapper.drawing
-    known = {number: (time, odometry) for number, time, odometry in sent}
+    known = {number: (moment, odometry) for number, moment, odometry in sent}
     if newest.number not in known:
         return
-    time, odometry = known[newest.number]
+    moment, odometry = known[newest.number]
     publisher.publish(
-        PoseReport(time, newest.pose, newest.spread, odometry, newest.doubt, newest.lost), drawing
+        PoseReport(moment, newest.pose, newest.spread, odometry, newest.doubt, newest.lost), drawing
     )
     mapper.drawing = None

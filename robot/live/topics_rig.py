@@ -62,7 +62,8 @@ class TopicsRig(PolledRig):
     Attributes:
         client: the connection. steps: of the session. latencies: from the arrival of the message that
             completed each sample to the mapper, s. spoilt: messages that could not be used, by topic.
-            outages: number of connections lost.
+            outages: number of connections lost. began: times of this process at the beginning, s: computing
+            and on the clock.
     """
 
     def __init__(
@@ -90,6 +91,7 @@ class TopicsRig(PolledRig):
         self.steps = self._new_steps()
         self.latencies = list[float]()
         self.spoilt, self.outages = Counter[str](), 0
+        self.began = time.process_time(), time.monotonic()
         self._transforms = list[Received]()  # before the session
         self._heard = dict[str, float]()  # time of the newest message by topic, s
         self._lost: float | None = None
@@ -192,6 +194,7 @@ class TopicsRig(PolledRig):
         self.steps.shape, self.steps.whiskers = shape
         now = time.monotonic()
         self.epoch, self._heard = now, dict.fromkeys(self.steps.topics, now)
+        self.began = time.process_time(), now
         self.messages.counts.clear()
         for item in self._transforms:
             self._record(item, self.messages.in_cdr(item))

@@ -15,7 +15,7 @@ ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE
 for store in (ROS1, ROS2):
     store.register(get_types_from_msg("float32 energy\nstring note", "lab_msgs/msg/Custom"))
 CREATE = {
-    "irobot_create_msgs/msg/HazardDetection": "uint8 BUMP=1\nuint8 CLIFF=2\nstd_msgs/Header header\nuint8 type",
+    "irobot_create_msgs/msg/HazardDetection": "uint8 BUMP=1\nstd_msgs/Header header\nuint8 type",
     "irobot_create_msgs/msg/HazardDetectionVector": (
         "std_msgs/Header header\nirobot_create_msgs/HazardDetection[] detections"
     ),

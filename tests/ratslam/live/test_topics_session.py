@@ -2,7 +2,10 @@
 and of its own recording, to the bit, and the map goes back to the robot."""
 
 import json
+import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -11,7 +14,7 @@ import numpy as np
 import pytest
 
 from ratslam.cli import main
-from tests.helpers.commands import refused, said, start
+from tests.helpers.commands import ROOT, refused, said, start
 from tests.helpers.ros_bags import ROS2, Entry, odometry, scan, write_bag
 from tests.helpers.stand_in_robot import PlainBridge, SdkBridge
 
@@ -45,7 +48,7 @@ def ranges(pose, angles):
 
 def rounds(count: float) -> list[Entry]:
     """Messages of a robot that drives rectangles of 4 m x 3 m: drifting odometry at 50 Hz, scans at 10."""
-    sides = [4.0, 3.0, 4.0, 3.0] * 4
+    sides = [4.0, 3.0] * 40
     pose, drifted, found, step = np.zeros(3), np.zeros(3), list[Entry](), 0
     for side in sides[: round(4 * count)]:
         for turn, steps in ((0.0, round(side / 0.4 * 50)), (np.pi / 2, round(np.pi / 2 / 0.7 * 50))):
@@ -187,6 +190,74 @@ def test_a_session_goes_on_with_a_map_and_localises_in_one(loopback, tmp_path):
         assert (tmp_path / "on" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
     steps = (tmp_path / "there" / "steps.csv").read_text().splitlines()
     assert len(steps) == there["views"] + 1
+
+
+MINUTES = os.environ.get("RATSLAM_TOPICS_MINUTES", "10")
+PLAYS = """
+import sys, time
+import numpy as np
+from tests.helpers.ros_bags import Entry, header
+from tests.helpers.stand_in_robot import SdkBridge
+from tests.ratslam.live.test_topics_session import KINDS, rounds
+host, minutes = sys.argv[1], float(sys.argv[2])
+picture = "sensor_msgs/msg/CompressedImage"
+robot = SdkBridge(host, KINDS | {"/camera": picture})
+entries = rounds(14)
+jpeg = np.random.default_rng(0).integers(0, 255, 50_000, np.uint8)
+last = entries[0].time
+content = {"header": header(last), "format": "jpeg", "data": jpeg}
+beside = [Entry("/camera", picture, last + k * 33_333_333, content) for k in range(int(minutes * 1800))]
+print(robot.address, flush=True)
+sys.stdin.readline()
+played = [entry for entry in entries if entry.time - last < minutes * 60e9]
+began, count = time.time(), {"/odom": 0, "/scan": 0}
+for entry in sorted([*played, *beside], key=lambda entry: entry.time):
+    now = began + (entry.time - last) / 1e9
+    time.sleep(max(now - time.time(), 0.0))
+    robot.send(entry)
+    if entry.topic in count:
+        count[entry.topic] += 1
+print(count["/odom"], count["/scan"], flush=True)
+sys.stdin.readline()
+robot.close()
+"""
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1500)
+def test_ten_minutes_lose_no_message_and_wait_for_none(loopback, tmp_path):
+    """Odometry at 50 Hz, scans at 10, and pictures beside them at 30, which nobody asked for."""
+    command = [sys.executable, "-c", PLAYS, loopback, MINUTES]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=ROOT, **pipes) as robot:
+        address = robot.stdout.readline().strip()
+        config = tmp_path / "robot.yaml"
+        config.write_text(
+            f"live: {{topics: {{source: '{address}'}}}}\n"
+            "recording: {topics: {odometry: /odom, views: {topic: /scan, max_range: 8.0}, samples: views}}\n"
+            "pose_cells: {cells_xy: 61, cell_size: 0.62}\nrecall: {sector_fov: 6.2832}\n"
+        )
+        process = start("live", config, "-o", tmp_path / "live")
+        while not (tmp_path / "live" / "session.mcap").exists():
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.05)
+        time.sleep(0.5)
+        robot.stdin.write("\n")
+        robot.stdin.flush()
+        sent = [int(word) for word in robot.stdout.readline().split()]
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=PATIENCE)
+        robot.stdin.write("\n")
+        robot.stdin.flush()
+    assert process.returncode == 130, told
+    report = json.loads((tmp_path / "live" / "live.json").read_text())
+    print(report)
+    assert report["messages"] == dict(zip(("/odom", "/scan"), sent, strict=True))
+    assert sum(report["dropped"].values()) < 0.01 * sent[1]
+    assert report["latency_s"]["p50"] < 0.005
+    assert report["latency_s"]["p99"] < 0.03
+    assert report["cpu"] < 0.05
 
 
 def test_what_cannot_be_mapped_is_refused_before_a_session(loopback, tmp_path, capsys):

@@ -329,7 +329,7 @@ def test_hazards_proximity_and_bumpers_of_a_create_are_touch_by_the_names_of_the
 def test_a_mount_that_is_repeated_on_tf_is_its_first_transform(write):
     rings = [scan(time, 1 + np.arange(72) % 7, -np.pi, np.pi / 36) for time in TIMES]
     once = opened(write(WHEELS, rings, [link("base_link", "laser", 1.0)]), views="/scan")
-    repeated = [entry for time in TIMES for entry in framed("base_link", "laser", [(0.0, 0.0, 1.0)], [time])]
+    repeated = framed("base_link", "laser", np.tile([0.0, 0.0, 1.0], (len(TIMES), 1)))
     again = opened(write(WHEELS, rings, repeated), views="/scan")
     views = [[sample.reading.view.tobytes() for sample in each] for each in (once, again)]
     assert views[0] == views[1]
