@@ -168,7 +168,7 @@ class OdometryTrack:
         self._count = 0
         self._time: float | None = None
         self._value = np.zeros(3)
-        self._paths = (_Path(), _Path()) if every > 1 else (_Path(),)
+        self._paths: tuple[_Path, ...] = (_Path(), _Path()) if every > 1 else (_Path(),)
         self._joined, self._newest = np.zeros(3), np.zeros(3)  # poses of the last joined row and message
         self._steps = deque[float](maxlen=101)
         self._fastest = 0.0
@@ -195,9 +195,8 @@ class OdometryTrack:
             if event[0] == PIECE:
                 self.piece += 1
             elif self.held:
-                held = np.array([self._value, new])
-                rows = from_velocities(np.array([last, time]), held[:, 0], held[:, 1], held[:, 2])
-                motion = rows[1, :3]
+                forward, left, turn = np.array([self._value, new]).T
+                motion = from_velocities(np.array([last, time]), forward, left, turn)[1, :3]
             else:
                 motion = between(self._value, new)
             self._steps.append(time - last)

@@ -217,7 +217,8 @@ def _summary_of(content: Any, kind: str, where: str) -> Any:
         return (len(content.name),), np.asarray(content.position, float)
     if kind in NAMED:
         values = TouchReader(kind, TouchTopic(topic="")).values(content, where)
-        return np.shape(values), values
+        values = np.zeros(0) if values is None else values
+        return values.shape, values
     if kind in ARRAYS:
         sizes = tuple(int(dim.size) for dim in content.layout.dim)
         return sizes or (len(content.data),), np.asarray(content.data, float)

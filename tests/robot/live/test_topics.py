@@ -252,10 +252,10 @@ class Listening:
     alive, failure = True, ""
 
     def __init__(self, lag: Callable[[], float] = lambda: 0.0) -> None:
-        self.samples, self.begun, self._lag = [], [], lag
+        self.samples, self.begun, self.lag = [], [], lag
 
     def behind(self) -> float:
-        return self._lag()
+        return self.lag()
 
     def offer(self, sample, begins=False) -> None:
         self.samples.append(sample)
@@ -452,7 +452,7 @@ def test_what_does_not_end_ends_the_session(name, loopback):
 def test_a_mapper_that_lags_drops_views_and_no_motion(loopback):
     robot, entries = PlainBridge(loopback, KINDS), drive(6.0)
     session = Session(robot.address, max_wait=30.0)
-    session.mapper._lag = lambda: 9.0 if len(session.mapper.samples) % 3 == 2 and next(dropping) else 0.0
+    session.mapper.lag = lambda: 9.0 if len(session.mapper.samples) % 3 == 2 and next(dropping) else 0.0
     dropping = iter([True] * 20 + [False] * 100_000)
     try:
         wait(lambda: robot.heard(list(KINDS)))
