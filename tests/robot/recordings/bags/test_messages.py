@@ -319,7 +319,7 @@ def test_hazards_proximity_and_bumpers_of_a_create_are_touch_by_the_names_of_the
     ]
     found = [sample.reading.view.ravel().tolist() for sample in opened(write(WHEELS, parts), touch="/bumper")]
     assert [row for row, view in enumerate(found) if view == [0.0, 1.0]] == [4]
-    with pytest.raises(InputError, match="no sensor .is_pressed. .*; expected one of is_left_pressed"):
+    with pytest.raises(InputError, match=r"no sensor .is_pressed. .*; expected one of is_left_pressed"):
         opened(write(WHEELS, parts), touch={"topic": "/bumper", "joints": ["is_pressed"]})
     (topic,) = (each for each in describe_bag(write(WHEELS, hazards)).topics if each.name == "/hazards")
     assert topic.roles == ("touch",)
