@@ -139,6 +139,7 @@ class FoxgloveClient:
             self._stack.close()
         while self._thread.is_alive():
             self.take(0.05)  # the thread may wait for room
+        self._stack.close()  # a connection that was just made again
 
     def _read_on(self) -> None:
         """Reads the connection, and makes a new one when it is lost, until the client is closed."""
@@ -215,16 +216,17 @@ class FoxgloveClient:
         self.channels = found
 
     def _subscribe(self) -> None:
-        new = [each for number, each in list(self._all.items()) if number not in self._subscribed]
-        taken = {each.topic for each in self._subscribed.values()}
-        wanted = [each for each in reversed(new) if each.topic not in taken and self._wanted(each)]
-        chosen = {each.number: each for each in {each.topic: each for each in wanted}.values()}
-        if not chosen:
-            return
-        self._subscribed |= chosen
-        asked = [{"id": number, "channelId": number} for number in chosen]
-        with suppress(OSError, _closed_errors()):
-            self._socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+        with self._lock:  # two threads come here
+            new = [each for number, each in list(self._all.items()) if number not in self._subscribed]
+            taken = {each.topic for each in self._subscribed.values()}
+            wanted = [each for each in reversed(new) if each.topic not in taken and self._wanted(each)]
+            chosen = {each.number: each for each in {each.topic: each for each in wanted}.values()}
+            if not chosen:
+                return
+            self._subscribed |= chosen
+            asked = [{"id": number, "channelId": number} for number in chosen]
+            with suppress(OSError, _closed_errors()):
+                self._socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
 
 
 def _channel_of(each: dict[str, Any]) -> Channel:

@@ -69,6 +69,8 @@ class LiveMessages(Messages):
         self._told = set[str]()
         self._stores: dict[str, Any] = {"cdr": get_typestore(Stores.ROS2_HUMBLE)}
         self._kept: dict[str, list[tuple[int, int, Any]]] = {}
+        self._definitions: dict[str, str] = {}
+        self._moves: dict[str, Any] = {}  # of ROS 1 to ROS 2, as rosbags keeps them
 
     def warn(self, sentence: str) -> None:
         if sentence not in self._told:
@@ -93,9 +95,11 @@ class LiveMessages(Messages):
 
     def definition(self, channel: Channel) -> str:
         """The definition of the messages of a topic, as ROS 2 writes it."""
-        store = self._stores["cdr"]
-        known = store.generate_msgdef(channel.kind, ros_version=2)[0]
-        return channel.definition if channel.notation == "ros2msg" and channel.definition else known
+        if channel.kind not in self._definitions:
+            text = channel.definition if channel.notation == "ros2msg" else ""
+            written = self._stores["cdr"].generate_msgdef(channel.kind, ros_version=2)[0]
+            self._definitions[channel.kind] = text or written
+        return self._definitions[channel.kind]
 
     def in_cdr(self, received: Received) -> bytes:
         """A message as ROS 2 encodes it.
@@ -111,7 +115,9 @@ class LiveMessages(Messages):
         stores = self._stores["ros1"], self._stores["cdr"]
         try:
             kinds = channel.kind, channel.kind
-            return bytes(migrate_bytes(*stores, *kinds, {}, received.content, src_is2=False, dst_is2=True))
+            return bytes(
+                migrate_bytes(*stores, *kinds, self._moves, received.content, src_is2=False, dst_is2=True)
+            )
         except Exception as error:  # whatever a decoder raises for damaged bytes
             raise self._damage(channel, received.content, error) from error
 

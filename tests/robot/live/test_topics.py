@@ -1,5 +1,7 @@
 """Topics of a running robot: samples as of a bag, to the bit; what a connection and a robot can do wrong."""
 
+import ssl
+import subprocess
 import time
 from collections.abc import Callable
 
@@ -481,4 +483,27 @@ def test_the_client_connects_only_where_it_is_told_and_bounds_what_it_takes(loop
         assert [item.name for item in client.take(PATIENCE)] == ["lost"]
     finally:
         client.close()
+        robot.close()
+
+
+def test_a_connection_with_tls_needs_a_certificate_that_is_trusted(loopback, tmp_path, monkeypatch):
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    made = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=robot"]
+    made += ["-addext", f"subjectAltName=IP:{loopback}", "-keyout", str(key), "-out", str(certificate)]
+    subprocess.run(made, check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    robot = PlainBridge(loopback, KINDS, ssl=context)
+    try:
+        with pytest.raises(InputError, match="no trusted connection"):
+            FoxgloveClient(robot.address, lambda channel: True)
+        monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+        client = FoxgloveClient(robot.address, lambda channel: True)
+        try:
+            wait(lambda: robot.heard(list(KINDS)))
+            robot.send(drive(0.1)[0])
+            assert [item.channel.topic for item in client.take(PATIENCE)] == ["/odom"]
+        finally:
+            client.close()
+    finally:
         robot.close()
