@@ -106,7 +106,7 @@ class Program(argparse.ArgumentParser):
                 if parser.group == group:
                     lines.append(f"{heading:<8}{name:<17}{parser.help}")
                     heading = ""
-        lines += ["", "ratslam COMMAND --help shows the options of a command and an example."]
+        lines += ["ratslam COMMAND --help shows the options of a command and an example."]
         return "\n".join(lines) + "\n"
 
 

@@ -35,7 +35,8 @@ def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
 def _open(config: RecordingConfig, judge: InputJudge) -> Source:
     """The recording as it is. Readers are imported when they are needed: some are slow to load."""
     file = config.file
-    assert file is not None
+    if file is None:
+        raise InputError("recording.file", "missing", "the path of a recording")
     suffix = file.suffix.lower()
     if suffix == ".mcap":
         from robot.recordings.mcap_reader import is_foreign

@@ -70,8 +70,8 @@ def _become_session(order: dict[str, Any], folder: Path) -> None:
     mapping = None if takes is None else partial(stub, str(folder / "run"), takes)
     run = ratslam.live.live_session.run_live_session
     # Without the process that draws the map.
-    ratslam.live.live_session.run_live_session = lambda *given, armed, view: run(
-        *given, mapping=mapping, view=view
+    ratslam.live.live_session.run_live_session = lambda *given, armed, **more: run(
+        *given, mapping=mapping, **more
     )
     if not order["rate_check"]:
         selftest.LISTEN_TIME = 0.3

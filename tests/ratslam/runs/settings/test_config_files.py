@@ -142,7 +142,7 @@ def test_settings_other_than_the_defaults_are_listed(tmp_path: Path) -> None:
     ]
     path.write_text("recording: {file: '/private/<b>.npz'}\n")
     # Without a default; and pages are shared, folders are private.
-    assert changed_settings(path) == [("recording.file", '"<b>.npz"', "")]
+    assert changed_settings(path) == [("recording.file", '"<b>.npz"', "null")]
     path.write_text("nonsense: 1\n")
     with pytest.raises(InputError, match="nonsense"):
         changed_settings(path)

@@ -569,7 +569,7 @@ def test_wrong_names_and_settings_are_errors_of_the_user(capsys):
     for arguments, words in (
         ("backend exampl", ["'exampl'", "did you mean 'example'?"]),
         ("source no", ["a source"]),
-        ("source file", ["settings.file", "missing"]),
+        ("source file", ["recording.file", "missing"]),
         ("source file --set settings.file=none.npz", ["none.npz"]),
         ("touch images --source no", ["--source", "a source"]),
         ("metric steps --set settings.facto=2", ["settings.facto", "did you mean 'factor'"]),
