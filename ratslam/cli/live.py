@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Registers the commands of this module."""
     live = commands.add(
-        "live", _live, "map with an arm and its whisker head, a Create, or a robot that publishes topics",
+        "live", _live, "map with an arm, a Create, or the topics of a robot",
         "live live_create --set live.create.plan.minutes=1", "live",
     )  # fmt: skip
     add_config(live)
@@ -48,7 +48,7 @@ def add_commands(commands: Commands) -> None:
     add_rerun(live)
 
     topics = commands.add(
-        "topics", _topics, "list what a running robot publishes, and write the configuration that maps it",
+        "topics", _topics, "list a running robot's topics; write a configuration",
         "topics ws://robot:8765 -o robot.yaml", "live",
     )  # fmt: skip
     topics.add_argument("address", metavar="ADDRESS", help="Foxglove bridge of the robot: ws://HOST:8765")
