@@ -43,6 +43,8 @@ TURN_LENGTH = 0.5
 """A turn counts as this much way, m/rad, where poses are compared."""
 RESTART = 3.0
 """Time that a robot may have driven before the first message of an odometry that began anew, s."""
+RENEWED = 16
+"""Messages after which the usual time between them is found anew."""
 SLOWEST, FEW = 0.05, 20
 """Speed that any robot may have, m/s; messages after which its own speed is known."""
 WAITING = 256
@@ -177,7 +179,7 @@ class OdometryTrack:
         self._paths: tuple[_Path, ...] = (_Path(), _Path()) if every > 1 else (_Path(),)
         self._joined, self._newest = np.zeros(3), np.zeros(3)  # poses of the last joined row and message
         self._steps = deque[float](maxlen=101)
-        self._fastest = 0.0
+        self._fastest, self._usual = 0.0, np.inf  # speed, m/s, and time between messages, s
         self._heading = self._turns = 0.0  # of the newest row; whole turns to add to it, rad
 
     @property
@@ -253,8 +255,9 @@ class OdometryTrack:
 
     def _judge(self, dt: float, new: np.ndarray, outage: bool) -> tuple[str, str]:
         """Whether the odometry goes on: the name of an event and what was found."""
-        usual = float(np.median(self._steps)) if len(self._steps) > 3 else np.inf
-        gap = dt > max(GAP * usual, LEAST_GAP)
+        if self._count % RENEWED == 0 or len(self._steps) < RENEWED:
+            self._usual = float(np.median(self._steps)) if len(self._steps) > 3 else np.inf
+        gap = dt > max(GAP * self._usual, LEAST_GAP)
         if self.held:
             if not gap:
                 return "", ""
