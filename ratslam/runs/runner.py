@@ -240,7 +240,7 @@ class Runner:
     def _judge_input(self) -> None:
         """Writes the verdict on the input to the manifest; judges the motion of what is no recording."""
         found = list(self._warnings)
-        if self._config.recording is None:
+        if self._config.recording is None or not self._source.digest:  # of a live session none was read yet
             time, poses = read_tum(self._directory.path / "odometry.tum")
             moved = between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
             motion = np.column_stack([moved, np.diff(time, prepend=time[:1])])
