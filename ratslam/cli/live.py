@@ -51,7 +51,9 @@ def add_commands(commands: Commands) -> None:
         "topics", _topics, "list a running robot's topics; write a configuration",
         "topics ws://robot:8765 -o robot.yaml", "live",
     )  # fmt: skip
-    topics.add_argument("address", metavar="ADDRESS", help="Foxglove bridge of the robot: ws://HOST:8765")
+    topics.add_argument(
+        "address", metavar="ADDRESS", help="of the robot: ws://HOST:8765 or zenoh://HOST:7447"
+    )
     topics.add_path("-o", "YAML", "write the configuration to a new file, for `live`")
     topics.add_argument(
         "--seconds", type=float, default=5.0, metavar="S", help="how long to listen (default 5)"

@@ -10,12 +10,13 @@ from typing import Any
 from mcap.writer import Writer
 
 from ratslam.service.recording_check import Diagnosis, diagnose_recording
-from robot.live.foxglove import Channel, FoxgloveClient, Received
 from robot.live.topic_steps import ROLES, LiveMessages
+from robot.live.topics_client import Channel, Received, TopicsClient, open_client
 from robot.recordings.bags.bag import TRANSFORMS
 from robot.recordings.bags.bag_description import BagDescription, TopicDescription, describe_bag
 from robot.recordings.bags.topics_config import TopicsConfig
 from robot.recordings.bags.views import CLOUD, LONGEST, SCAN
+from robot.recordings.mcap_writer import MessageWriter
 from tactile.base.errors import InputError
 
 USED = TRANSFORMS.union(*ROLES.values())
@@ -31,13 +32,13 @@ def diagnose_topics(address: str, seconds: float) -> Diagnosis:
     """Listens to a robot, as `doctor` reads a bag, and writes nothing.
 
     Args:
-        address: of its Foxglove bridge. seconds: how long to listen.
+        address: of its Foxglove bridge or Zenoh router. seconds: how long to listen.
 
     Raises:
         InputError: nothing answers there.
     """
     messages = LiveMessages(address, TopicsConfig(), lambda sentence: None)
-    client = FoxgloveClient(address, lambda channel: False)
+    client = open_client(address, lambda channel: False)
     try:
         time.sleep(DISCOVERY if not client.channels else 0.2)
         messages.list_topics(client.channels)
@@ -51,13 +52,14 @@ def diagnose_topics(address: str, seconds: float) -> Diagnosis:
         client.close()
 
 
-def _record(client: FoxgloveClient, messages: LiveMessages, path: Path, seconds: float) -> int:
+def _record(client: TopicsClient, messages: LiveMessages, path: Path, seconds: float) -> int:
     """Writes what is published for some time to a new bag; returns the number of messages."""
     client.want(lambda channel: channel.kind in USED and messages.readable(channel))
-    due, channels, count = time.monotonic() + seconds, dict[str, int](), 0
+    due, count = time.monotonic() + seconds, 0
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="ros2", library="topics")
+        found = MessageWriter(writer)
         while (rest := due - time.monotonic()) > 0:
             for item in client.take(rest):
                 if not isinstance(item, Received):
@@ -66,12 +68,8 @@ def _record(client: FoxgloveClient, messages: LiveMessages, path: Path, seconds:
                     content = messages.in_cdr(item)
                 except InputError:
                     continue
-                channel = item.channel
-                if channel.topic not in channels:
-                    text = messages.definition(channel).encode()
-                    schema = writer.register_schema(channel.kind, "ros2msg", text)
-                    channels[channel.topic] = writer.register_channel(channel.topic, "cdr", schema)
-                writer.add_message(channels[channel.topic], item.time, content, item.time)
+                topic, kind, text = item.channel.topic, item.channel.kind, messages.definition(item.channel)
+                found.add(topic, kind, text, item.time, content)
                 count += 1
         writer.finish()
     return count
@@ -80,7 +78,7 @@ def _record(client: FoxgloveClient, messages: LiveMessages, path: Path, seconds:
 def _of_robot(
     address: str,
     seconds: float,
-    client: FoxgloveClient,
+    client: TopicsClient,
     found: BagDescription | None,
     heard: Diagnosis,
     folder: str,

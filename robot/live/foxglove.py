@@ -10,114 +10,45 @@ from version 3 on (`foxglove.sdk.v1`) send too.
 from __future__ import annotations
 
 import json
-import queue
 import ssl
 import struct
 import threading
 import time
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from typing import Any, NamedTuple
+from typing import Any
 
+from robot.live.topics_client import (
+    CONNECT_TIMEOUT,
+    LARGEST,
+    MOST_TOPICS,
+    Channel,
+    Received,
+    TopicsClient,
+    Wanted,
+)
 from tactile.base.errors import InputError
 
 SUBPROTOCOLS: tuple[Any, ...] = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-LARGEST = 1 << 26
-"""Largest message that is accepted, bytes."""
-WAITING = 4096
-"""Messages that may wait to be taken; then the client reads no further."""
-MOST_TOPICS = 10_000
-"""Topics of a server of which more are ignored."""
 RETRY, LONGEST_RETRY = 0.1, 2.0
 """Waiting time before a lost connection is made again, at first and at most, s."""
-CONNECT_TIMEOUT = 5.0
-"""Time limit of making a connection, s."""
 START = "on the robot: `ros2 launch foxglove_bridge foxglove_bridge_launch.xml`"
 _MESSAGE = struct.Struct("<BIQ")  # opcode, subscription, time of the server in ns
 
 
-class Channel(NamedTuple):
-    """A topic as it is advertised.
+class FoxgloveClient(TopicsClient):
+    """A connection to a server at `ws://HOST:PORT` or `wss://HOST:PORT`."""
 
-    Attributes:
-        number: of the server's. topic: its name. encoding: of its messages, `cdr` or `ros1`. kind: type of
-            its messages, such as nav_msgs/msg/Odometry. definition: of the type, as text.
-        notation: of the definition: ros2msg, ros2idl or ros1msg.
-    """
-
-    number: int
-    topic: str
-    encoding: str
-    kind: str
-    definition: str
-    notation: str
-
-
-class Received(NamedTuple):
-    """A message. Attributes: time: of its arrival, ns since 1970."""
-
-    channel: Channel
-    time: int
-    content: bytes
-
-
-class Notice(NamedTuple):
-    """What happened to the connection. Attributes: name: `lost`, `back`, `vanished` (a topic) or `garbage`.
-    time: ns since 1970."""
-
-    name: str
-    time: int
-    text: str
-
-
-class FoxgloveClient:
-    """A connection to a server, made again whenever it is lost.
-
-    Args:
-        address: `ws://HOST:PORT` or `wss://HOST:PORT`. wanted: whether a topic is to be subscribed to; it may
-            be changed by `want`.
-
-    Attributes:
-        channels: topics that the server advertises, by name; the first of several with one name.
-            doubled: names that several channels have. name: of the server. accepts: encodings that the
-            server accepts from clients, empty if none may publish.
-
-    Raises:
-        InputError: nothing answers at the address, or it is another server.
-    """
-
-    def __init__(self, address: str, wanted: Callable[[Channel], bool]) -> None:
-        self.address, self._wanted = address, wanted
-        self.channels: dict[str, Channel] = {}
-        self.doubled: set[str] = set()
-        self.name, self.accepts = "", tuple[str, ...]()
+    def __init__(self, address: str, wanted: Wanted) -> None:
+        super().__init__(address, wanted)
         self._all: dict[int, Channel] = {}
         self._subscribed: dict[int, Channel] = {}  # by the number of the subscription, that of the channel
         self._published: dict[str, int] = {}
-        self._taken: queue.Queue[Received | Notice] = queue.Queue(WAITING)
-        self._closed = threading.Event()
         self._lock = threading.Lock()
         self._socket, self._stack = _connect(address)
         self._thread = threading.Thread(target=self._read_on, daemon=True, name=f"topics of {address}")
         self._thread.start()
 
-    def want(self, wanted: Callable[[Channel], bool]) -> None:
-        """Subscribes to other topics, besides those that are subscribed to already."""
-        self._wanted = wanted
-        self._subscribe()
-
-    def take(self, longest: float) -> list[Received | Notice]:
-        """What came since the last call, in its order; waits up to `longest` s for the first."""
-        found = list[Received | Notice]()
-        with suppress(queue.Empty):
-            found.append(self._taken.get(timeout=longest))
-            while True:
-                found.append(self._taken.get_nowait())
-        return found
-
     def publish(self, topic: str, kind: str, content: bytes) -> None:
-        """Sends a message in CDR to a topic; does nothing while there is no connection, or if the server does
-        not accept messages."""
         if "cdr" not in self.accepts:
             return
         with self._lock, suppress(OSError, _closed_errors()):
@@ -133,7 +64,6 @@ class FoxgloveClient:
             self._socket.send(struct.pack("<BI", 1, self._published[topic]) + content)
 
     def close(self) -> None:
-        """Ends the connection."""
         self._closed.set()
         with suppress(OSError, _closed_errors()):
             self._stack.close()
@@ -161,15 +91,6 @@ class FoxgloveClient:
                     self._socket, self._stack = _connect(self.address)
                     self._note("back", "connected again")
                     break
-
-    def _note(self, name: str, text: str) -> None:
-        self._put(Notice(name, time.time_ns(), text))
-
-    def _put(self, item: Received | Notice) -> None:
-        while not self._closed.is_set():
-            with suppress(queue.Full):
-                self._taken.put(item, timeout=0.1)
-                return
 
     def _receive(self, message: str | bytes, now: int) -> None:
         try:
@@ -201,19 +122,14 @@ class FoxgloveClient:
             for number in content["channelIds"]:
                 gone = self._all.pop(int(number), None)
                 if gone is not None and self._subscribed.pop(gone.number, None) is not None:
-                    self._note("vanished", f"{gone.topic} is no longer advertised")
+                    self._note("vanished", f"{gone.topic} is no longer advertised", gone.topic)
             self._list_channels()
+            self._subscribe()  # another of that name
         elif kind == "status" and int(content.get("level", 0)) >= 2:
             self._note("garbage", f"the robot's side reports: {content.get('message', '')}")
 
     def _list_channels(self) -> None:
-        found = dict[str, Channel]()
-        self.doubled = set()
-        for channel in list(self._all.values()):
-            if channel.topic in found:
-                self.doubled.add(channel.topic)
-            found.setdefault(channel.topic, channel)
-        self.channels = found
+        self.channels = {channel.topic: channel for channel in reversed(list(self._all.values()))}
 
     def _subscribe(self) -> None:
         with self._lock:  # two threads come here

@@ -62,7 +62,8 @@ class TopicsLiveConfig(Settings):
     """A running robot, simulator or player that publishes topics, which `recording.topics` assigns."""
 
     source: str = Field(min_length=1)
-    """Address: `ws://HOST:8765` of a Foxglove bridge, or `wss://` with TLS."""
+    """Address: `ws://HOST:8765` of a Foxglove bridge, or `wss://` with TLS; `zenoh://HOST:7447/DOMAIN` of the
+    router of `rmw_zenoh`, or `zenoh+tls://`; the domain may be left out if it is 0."""
     max_wait: PositiveFloat = 0.2
     """Longest time that a view waits for the odometry at its stamp, s; then it is dropped, and its motion is
     part of the next one's."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robot.live.foxglove import FoxgloveClient
+from robot.live.topics_client import TopicsClient
 from tactile.base.se2 import compose, inverse
 
 PERIOD = 1.0
@@ -53,7 +53,7 @@ class Drawing(NamedTuple):
 class MapPublisher:
     """Publishes over the connection to a robot."""
 
-    def __init__(self, client: FoxgloveClient) -> None:
+    def __init__(self, client: TopicsClient) -> None:
         from rosbags.typesys import Stores, get_typestore
 
         self._client, self._store = client, get_typestore(Stores.ROS2_HUMBLE)

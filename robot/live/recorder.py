@@ -93,6 +93,7 @@ class LiveRecorder(AbstractContextManager["LiveRecorder"]):
         with self._writing(arrival / 1e9) as able:
             if able:
                 self._tape.append_message(topic, kind, definition, arrival, content)
+                self._write_if_due(arrival / 1e9)
 
     def add_event(self, time: float, name: str, text: str) -> None:
         """Adds an event and flushes the file.

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robot.drivers.outcome import SessionOutcome
-from robot.live.foxglove import Channel, Received
 from robot.live.polling import session_fault
+from robot.live.topics_client import Channel, Received
 from robot.recordings.bags.bag import Messages, Topic, learn_type
 from robot.recordings.bags.bag_reader import TOUCHES, TouchReader
 from robot.recordings.bags.topics_config import TopicsConfig
@@ -86,7 +86,8 @@ class LiveMessages(Messages):
                 from rosbags.typesys import Stores, get_typestore
 
                 self._stores["ros1"] = get_typestore(Stores.ROS1_NOETIC)
-            for store in self._stores.values() if channel.notation != "ros2idl" else ():
+            told = channel.definition and channel.notation != "ros2idl"
+            for store in self._stores.values() if told else ():
                 learn_type(store, channel.kind, channel.definition)
         # That messages come is awaited, not asked.
         self.topics = {name: Topic(name, channel.kind, 1) for name, channel in sorted(channels.items())}
@@ -327,6 +328,7 @@ class TopicSteps:
         config: topics and images. messages: of the robot. say: is told of events, by name and text.
 
     Attributes:
+        topics: names of those that are used, besides transforms. odometry: name of its topic.
         shape: (R, C, 1) of the views; None before the first touch reading, whose layout may say it.
         whiskers: number of touch sensors, 0 for other views. dropped: views so far, by cause.
     """
@@ -341,6 +343,9 @@ class TopicSteps:
         assert config.topics is not None
         self._config, self._topics, self._messages, self._say = config, config.topics, messages, say
         self._wait, self._chosen = max_wait, chosen_topics(config.topics, messages)
+        self.topics = {topic.name for topic in self._chosen.values()}
+        self.odometry = self._chosen["odometry"].name
+        self._seen = next(self._chosen[name].name for name in ("views", "touch") if name in self._chosen)
         odometry = self._topics.odometry
         assert odometry is not None
         held = holds_velocities(odometry, self._chosen["odometry"].kind)
@@ -370,9 +375,9 @@ class TopicSteps:
         return (like.rows, like.columns, 1), 0
 
     @property
-    def topics(self) -> set[str]:
-        """Names of the topics that are used, besides transforms."""
-        return {topic.name for topic in self._chosen.values()}
+    def mounted(self) -> bool:
+        """Whether the first view was seen, for whose sensor the transforms are."""
+        return self._reader is not None
 
     def interrupt(self) -> None:
         """Says that the connection was lost: messages may be missing."""
@@ -389,11 +394,10 @@ class TopicSteps:
             SessionFault: the odometry cannot be believed, or the clock of the robot was set back.
         """
         messages = self._messages
-        number = messages.counts[topic]
-        place = f"{messages.path}, {topic}, message {number}"
-        if topic == self._chosen["odometry"].name:
+        place = f"{messages.path}, {topic}, message {messages.counts[topic]}"
+        if topic == self.odometry:
             self._add_odometry(topic, arrival, content, place)
-        if topic in {self._chosen[name].name for name in ("views", "touch") if name in self._chosen}:
+        if topic == self._seen:
             stamp = messages.stamp(content, arrival)
             if self._body is None:
                 self._early.append((stamp, arrival, content, place))
@@ -454,14 +458,15 @@ class TopicSteps:
             return True
         self.dropped["out of order"] += 1
         since = self._back.setdefault(topic, arrival)
-        if arrival - since > 1_000_000_000:
-            found = (
-                f"for 1 s all stamps are earlier than {last / 1e9:.3f} s, now by {(last - stamp) / 1e9:.3g} s"
-            )
-            raise session_fault(
-                SessionOutcome.CLOCK_JUMPED, f"{topic}: {found}: the robot's clock was set back"
-            )
-        return False
+        if arrival - since <= 1_000_000_000:
+            return False
+        if stamp == last:
+            found = f"{topic}: for 1 s all stamps are {last / 1e9:.3f} s: its node does not stamp messages"
+            cure = "`--set recording.topics.clock=bag` takes the times of their arrival"
+            raise session_fault(SessionOutcome.TOPIC_UNUSABLE, f"{found}; {cure}")
+        found = f"{topic}: for 1 s all stamps are earlier than {last / 1e9:.3f} s"
+        said = f"{found}, now by {(last - stamp) / 1e9:.3g} s: the robot's clock was set back"
+        raise session_fault(SessionOutcome.CLOCK_JUMPED, said)
 
     def _add_odometry(self, topic: str, arrival: int, content: Any, place: str) -> None:
         config = self._topics.odometry
@@ -488,9 +493,8 @@ class TopicSteps:
             kind = self._chosen["odometry"].kind
             self._body = self._topics.body or child or ("" if kind in POSES else frame)
             early, self._early = list(self._early), deque(maxlen=WAITING)
-            seen = next(self._chosen[name].name for name in ("views", "touch") if name in self._chosen)
             for view in early:
-                if self._in_order(seen, view[0], view[1]):
+                if self._in_order(self._seen, view[0], view[1]):
                     self._add_view(*view)
 
     def _judge(self, topic: str) -> None:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from robot.drivers.outcome import SessionOutcome
-from robot.live.foxglove import Channel, FoxgloveClient, Notice, Received
 from robot.live.live_config import LiveConfig, TopicsLiveConfig
 from robot.live.polling import (
     TICK,
@@ -25,7 +24,9 @@ from robot.live.polling import (
     session_fault,
 )
 from robot.live.topic_steps import LiveMessages, TopicSteps, chosen_topics
+from robot.live.topics_client import Channel, Notice, Received, open_client
 from robot.recordings.bags.bag import TRANSFORMS, Topic
+from robot.recordings.bags.transforms import STATIC
 from robot.recordings.cdr import PIECE, Event
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import SPOILT
@@ -79,7 +80,7 @@ class TopicsRig(PolledRig):
         self.topics, self._recording = config.topics, recording
         self.messages = LiveMessages(self.topics.source, recording.topics, say)
         self._kinds: dict[str, str] = {}  # of the topics that are used or recorded
-        self.client = FoxgloveClient(self.topics.source, self._wanted)
+        self.client = open_client(self.topics.source, self._wanted)
         try:
             chosen = self._discover()
         except BaseException:
@@ -221,7 +222,8 @@ class TopicsRig(PolledRig):
             content = self.messages.in_cdr(item)
             self._record(item, content)
             if channel.kind in TRANSFORMS:
-                self.messages.keep(topic, item.time, self.messages.decode(channel, content))
+                if topic.endswith(STATIC) or not self.steps.mounted:
+                    self.messages.keep(topic, item.time, self.messages.decode(channel, content))
             elif topic in self.steps.topics:
                 self.steps.add(topic, item.time, self.messages.decode(channel, content))
         except InputError as error:
@@ -236,6 +238,8 @@ class TopicsRig(PolledRig):
         if item.name == "lost":
             self._lost, self.outages = time.monotonic(), self.outages + 1
             self.steps.interrupt()
+        elif item.name == "vanished" and item.topic == self.steps.odometry:
+            self.steps.interrupt()  # the node that comes back may begin anew
         elif item.name == "back":
             self._lost = None
         if item.name == "garbage":
@@ -252,8 +256,16 @@ class TopicsRig(PolledRig):
             raise session_fault(SessionOutcome.CONNECTION_LOST, detail)
         for topic in sorted(self.steps.topics):
             if self._lost is None and now - self._heard[topic] > longest:
-                raise session_fault(SessionOutcome.TOPIC_SILENT, f"{topic}: no message for {longest:g} s")
+                detail = f"{topic}: no message for {longest:g} s{self._known_cause(topic)}"
+                raise session_fault(SessionOutcome.TOPIC_SILENT, detail)
         self._check()
+
+    def _known_cause(self, topic: str) -> str:
+        """Why no messages of a topic come, as far as the robot says it."""
+        channel, kind = self.client.channels.get(topic), self._kinds[topic]
+        if channel is None:
+            return ": it is no longer advertised"
+        return f": it is advertised as {channel.kind} now, not as {kind}" if channel.kind != kind else ""
 
     def _check(self) -> None:
         if self.recorder is not None and self.recorder.fault:

@@ -35,6 +35,25 @@ class RecordingWriteError(InputError):
         super().__init__(str(path), f"cannot be written any further ({error.strerror or error})", "", cure)
 
 
+class MessageWriter:
+    """Writes messages of other programs in CDR, as any bag has them."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._channels: dict[str, int] = {}
+
+    def add(self, topic: str, kind: str, definition: str, time: int, content: bytes) -> None:
+        """Adds a message.
+
+        Args:
+            kind: its type, which `definition` defines in the text of ROS 2. time: of its arrival, ns.
+        """
+        if topic not in self._channels:
+            schema = self._writer.register_schema(kind, "ros2msg", definition.encode())
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
+        self._writer.add_message(self._channels[topic], time, content, time)
+
+
 class Recorder(AbstractContextManager["Recorder"]):
     """Writes a new file; a context manager.
 
@@ -67,13 +86,13 @@ class Recorder(AbstractContextManager["Recorder"]):
         self._chunk_s = chunk_s
         self._pending, self._flushed = 0, -np.inf  # bytes in the open chunk; time of the last closed one
         self._channels: dict[str, int] = {}
-        self._others: dict[str, int] = {}  # channels of other programs' topics
         self.count = 0
         self._number = 0
         self._failed = False
         # Chunks are ended here, never by the library, so that each one reaches the operating system whole.
         file = cast(Any, self._file)
         self._writer = Writer(file, 1 << 62, compression=CompressionType.ZSTD, enable_data_crcs=True)
+        self._others = MessageWriter(self._writer)
         self._writer.start(profile="ros2", library=_program())
         self._writer.add_metadata(METADATA, metadata)
         self.flush()
@@ -120,15 +139,8 @@ class Recorder(AbstractContextManager["Recorder"]):
             self._flushed = time
 
     def append_message(self, topic: str, kind: str, definition: str, time: int, content: bytes) -> None:
-        """Append a message of another program in CDR, as any bag has it.
-
-        Args:
-            kind: its type, which `definition` defines in the text of ROS 2. time: of its arrival, ns.
-        """
-        if topic not in self._others:
-            schema = self._writer.register_schema(kind, "ros2msg", definition.encode())
-            self._others[topic] = self._writer.register_channel(topic, "cdr", schema)
-        self._writer.add_message(self._others[topic], time, content, time)
+        """Append a message of another program; see `MessageWriter.add`."""
+        self._others.add(topic, kind, definition, time, content)
         self._pending += len(content)
         if self._pending >= _CHUNK_BYTES:
             self.flush()

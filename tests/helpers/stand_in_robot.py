@@ -1,14 +1,17 @@
-"""Robots that publish topics on loopback: a bridge played by `foxglove-sdk`, and one written here that speaks
-the older protocol and can be cut, fall silent and send garbage."""
+"""Robots that publish topics on loopback: a bridge played by `foxglove-sdk`, one written here that speaks the
+older protocol and can be cut, fall silent and send garbage, and a robot on `rmw_zenoh`."""
 
 import json
+import socket
 import struct
 import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import foxglove
+import zenoh
 from websockets.sync.server import ServerConnection, serve
+from zenoh.ext import CacheConfig, Int64, declare_advanced_publisher, z_serialize
 
 from tests.helpers.ros_bags import ROS1, ROS2, Entry, built
 
@@ -34,7 +37,10 @@ class SdkBridge:
 
     def send(self, *entries: Entry) -> None:
         for entry in entries:
-            self._channels[entry.topic].log(in_cdr(entry))
+            self.send_raw(entry.topic, in_cdr(entry))
+
+    def send_raw(self, topic: str, content: bytes, time: int = 0) -> None:
+        self._channels[topic].log(content)
 
     def heard(self, topics: Sequence[str]) -> bool:
         """Whether a client is subscribed to all of these topics."""
@@ -57,7 +63,8 @@ class PlainBridge:
     def __init__(
         self, host: str, kinds: Mapping[str, str], *, ros1: bool = False, port: int = 0, ssl: Any = None
     ) -> None:
-        self.kinds, self._ros1 = dict(kinds), ros1
+        self._topics, self._ros1 = dict(enumerate(kinds.items())), ros1
+        self._count = len(kinds)
         self._clients: dict[ServerConnection, dict[str, int]] = {}
         self.published: list[tuple[str, str, bytes]] = []
         protocols: Any = ["foxglove.websocket.v1"]
@@ -69,7 +76,7 @@ class PlainBridge:
     def _meet(self, client: ServerConnection) -> None:
         able = {"capabilities": ["clientPublish"], "supportedEncodings": ["cdr"]}
         client.send(json.dumps({"op": "serverInfo", "name": "plain", **able}))
-        client.send(json.dumps({"op": "advertise", "channels": self._channels()}))
+        client.send(json.dumps({"op": "advertise", "channels": self._channels(self._topics)}))
         self._clients[client] = {}
         offered: dict[int, tuple[str, str]] = {}
         for message in client:
@@ -79,15 +86,27 @@ class PlainBridge:
                 continue
             said = json.loads(message)
             if said["op"] == "subscribe":
-                names = list(self.kinds)
                 for each in said["subscriptions"]:
-                    self._clients[client][names[each["channelId"]]] = each["id"]
+                    self._clients[client][self._topics[each["channelId"]][0]] = each["id"]
             elif said["op"] == "advertise":
                 offered |= {each["id"]: (each["topic"], each["schemaName"]) for each in said["channels"]}
 
-    def _channels(self) -> list[dict[str, Any]]:
+    def advertise(self, topic: str, kind: str) -> None:
+        new = {self._count: (topic, kind)}
+        self._topics |= new
+        self._count += 1
+        self.say(json.dumps({"op": "advertise", "channels": self._channels(new)}))
+
+    def withdraw(self, topic: str) -> None:
+        number = next(number for number, (name, _) in self._topics.items() if name == topic)
+        del self._topics[number]
+        for subscribed in self._clients.values():
+            subscribed.pop(topic, None)
+        self.say(json.dumps({"op": "unadvertise", "channelIds": [number]}))
+
+    def _channels(self, topics: Mapping[int, tuple[str, str]]) -> list[dict[str, Any]]:
         found = []
-        for number, (topic, kind) in enumerate(self.kinds.items()):
+        for number, (topic, kind) in topics.items():
             if self._ros1:
                 text, name, encoding = ROS1.generate_msgdef(kind)[0], kind.replace("/msg/", "/"), "ros1"
             else:
@@ -133,3 +152,111 @@ class PlainBridge:
     def close(self) -> None:
         self._server.shutdown()
         self.cut()
+
+
+WRITTEN = {
+    "nav_msgs/msg/Odometry": "nav_msgs::msg::dds_::Odometry_",
+    "sensor_msgs/msg/LaserScan": "sensor_msgs::msg::dds_::LaserScan_",
+    "sensor_msgs/msg/Imu": "sensor_msgs::msg::dds_::Imu_",
+    "tf2_msgs/msg/TFMessage": "tf2_msgs::msg::dds_::TFMessage_",
+    "lab_msgs/msg/Custom": "lab_msgs::msg::dds_::Custom_",
+}
+"""Types as `rmw_zenoh` writes them."""
+
+
+def opened(**settings: Any) -> Any:
+    """A session of Zenoh that finds nobody by itself."""
+    config = zenoh.Config()
+    own = {"scouting/multicast/enabled": False, "timestamping/enabled": True, "listen/endpoints": []}
+    for name, value in (own | settings).items():
+        config.insert_json5(name, json.dumps(value))
+    return zenoh.open(config)
+
+
+class ZenohRobot:
+    """A robot on `rmw_zenoh`: its router, and a node that publishes by way of it.
+
+    Args:
+        kinds: type of each topic; `/tf_static` is repeated to those who come later. domain: of ROS 2.
+            humble: whether types have no hashes.
+
+    Attributes:
+        published: messages of clients, as (topic, type, bytes); beside them, what came with each.
+    """
+
+    def __init__(self, host: str, kinds: Mapping[str, str], *, domain: int = 0, humble: bool = False) -> None:
+        with socket.socket() as probe:
+            probe.bind((host, 0))
+            self._endpoint = f"tcp/{host}:{probe.getsockname()[1]}"
+        self.address = f"zenoh://{self._endpoint[4:]}/{domain}"
+        self.published: list[tuple[str, str, bytes]] = []
+        self.beside: list[bytes] = []
+        self._domain, self._humble = domain, humble
+        self._sent = 0
+        self._publishers: dict[str, Any] = {}
+        self._tokens: dict[str, Any] = {}
+        self.route()
+        self._node = opened(**{"mode": "peer", "connect/endpoints": [self._endpoint]})
+        beginning = f"@ros2_lv/{domain}/{self._node.zid()}/0"
+        alive = self._node.liveliness()
+        self._others = [
+            alive.declare_token(f"{beginning}/0/NN/%/%/driver"),
+            alive.declare_token(
+                f"{beginning}/1/MS/%/%/driver/%heard/{WRITTEN['sensor_msgs/msg/Imu']}/x/::,1:,:,:,,"
+            ),
+        ]
+        self._ears = self._node.declare_subscriber(
+            f"{domain}/ratslam/**", self._hear, allowed_origin=zenoh.Locality.REMOTE
+        )
+        for topic, kind in kinds.items():
+            self.advertise(topic, kind)
+
+    def advertise(self, topic: str, kind: str) -> None:
+        fixed, written, number = topic.endswith("tf_static"), WRITTEN[kind], len(self._publishers) + 2
+        hashed = "TypeHashNotSupported" if self._humble else ROS2.hash_rihs01(kind)
+        key = f"{self._domain}/{topic[1:]}/{written}/{hashed}"
+        if fixed:
+            options: dict[str, Any] = {"cache": CacheConfig(1), "publisher_detection": True}
+            self._publishers[topic] = declare_advanced_publisher(self._node, key, **options)
+        else:
+            block = zenoh.CongestionControl.BLOCK
+            self._publishers[topic] = self._node.declare_publisher(key, congestion_control=block)
+        mangled, quality = topic.replace("/", "%"), ":1:,1:,:,:,," if fixed else "::,10:,:,:,,"
+        said = f"@ros2_lv/{self._domain}/{self._node.zid()}/0/{number}/MP/%/%/driver/{mangled}/{written}"
+        self._tokens[topic] = self._node.liveliness().declare_token(f"{said}/{hashed}/{quality}")
+
+    def withdraw(self, topic: str) -> None:
+        self._tokens.pop(topic).undeclare()
+        self._publishers.pop(topic).undeclare()
+
+    def _hear(self, sample: Any) -> None:
+        topic, kind, _ = str(sample.key_expr).partition("/")[2].rsplit("/", 2)
+        self.published.append((f"/{topic}", kind, sample.payload.to_bytes()))
+        self.beside.append(sample.attachment.to_bytes())
+
+    def send(self, *entries: Entry) -> None:
+        for entry in entries:
+            self.send_raw(entry.topic, in_cdr(entry))
+
+    def send_raw(self, topic: str, content: bytes, time: int = 0) -> None:
+        self._sent += 1
+        number, at = Int64(self._sent), Int64(time)
+        beside = z_serialize(("sequence_number", number, "source_timestamp", at, "source_gid", bytes(16)))
+        self._publishers[topic].put(content, attachment=beside)
+
+    def heard(self, topics: Sequence[str]) -> bool:
+        return all(self._publishers[topic].matching_status.matching for topic in topics)
+
+    def route(self) -> None:
+        """Starts the router."""
+        settings = {"mode": "router", "listen/endpoints": [self._endpoint]}
+        self._router = opened(**settings)
+
+    def cut(self) -> None:
+        """Breaks all connections: the router ends and starts anew."""
+        self._router.close()
+        self.route()
+
+    def close(self) -> None:
+        self._node.close()
+        self._router.close()

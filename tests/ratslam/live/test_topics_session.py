@@ -8,15 +8,18 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from ratslam.cli import main
 from tests.helpers.commands import ROOT, refused, said, start
 from tests.helpers.ros_bags import ROS2, Entry, odometry, scan, write_bag
-from tests.helpers.stand_in_robot import PlainBridge, SdkBridge
+from tests.helpers.stand_in_robot import PlainBridge, SdkBridge, ZenohRobot, in_cdr
 
 KINDS = {
     "/odom": "nav_msgs/msg/Odometry",
@@ -67,12 +70,27 @@ def rounds(count: float) -> list[Entry]:
     return sorted(found, key=lambda entry: entry.time)
 
 
+class Message(NamedTuple):
+    """A message as it is sent. Attributes: time: ns."""
+
+    time: int
+    topic: str
+    content: bytes
+
+
+def written(entries: list[Entry]) -> list[Message]:
+    return [Message(entry.time, entry.topic, in_cdr(entry)) for entry in entries]
+
+
 class Player:
     """Plays messages to a bridge from a thread, at a multiple of their speed; again and again until `done`,
-    if `endless`."""
+    if `endless`. All connections are cut before the messages of the numbers `cuts`."""
 
-    def __init__(self, bridge, entries: list[Entry], speed: float, endless: bool = False) -> None:
-        self._bridge, self._entries, self._speed, self._endless = bridge, entries, speed, endless
+    def __init__(
+        self, bridge, messages: list[Message], speed: float, endless: bool = False, cuts: Sequence[int] = ()
+    ) -> None:
+        self._bridge, self._messages, self._speed, self._endless = bridge, messages, speed, endless
+        self._cuts = set(cuts)
         self.done = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
         self._thread.start()
@@ -85,20 +103,28 @@ class Player:
         self.done.set()
 
     def _play_once(self) -> None:
-        began, first = time.monotonic(), self._entries[0].time
-        for entry in self._entries:
-            due = began + (entry.time - first) / 1e9 / self._speed
+        began, first = time.monotonic(), self._messages[0].time
+        for number, message in enumerate(self._messages):
+            due = began + (message.time - first) / 1e9 / self._speed
             time.sleep(max(due - time.monotonic(), 0.0))
-            self._bridge.send(entry)
+            if number in self._cuts:
+                self._bridge.cut()
+            self._bridge.send_raw(message.topic, message.content)
             if self._endless and self.done.is_set():
                 return
 
 
-def session(bridge, config: Path, folder: Path, entries: list[Entry], speed: float, *more: str) -> dict:
+PATIENT = "live.topics.max_wait=30", "live.budget=60"
+"""Settings with which no view is dropped."""
+
+
+def session(
+    bridge, config: Path, folder: Path, messages: list[Message], speed: float, *more: object,
+    settings: Sequence[str] = PATIENT, cuts: Sequence[int] = (),
+) -> dict:  # fmt: skip
     """Runs a session while messages are played, ends it with Ctrl-C, and returns its report."""
-    process = start(
-        "live", config, "-o", folder, "--set", "live.topics.max_wait=30", "--set", "live.budget=60", *more
-    )
+    given = [word for setting in settings for word in ("--set", setting)]
+    process = start("live", config, "-o", folder, *given, *more)
     try:
         due = time.monotonic() + PATIENCE
         while not (folder / "session.mcap").exists():
@@ -106,8 +132,9 @@ def session(bridge, config: Path, folder: Path, entries: list[Entry], speed: flo
             assert time.monotonic() < due
             time.sleep(0.05)
         time.sleep(0.3)
-        player = Player(bridge, entries, speed)
-        assert player.done.wait(PATIENCE + len(entries) / 50)
+        player = Player(bridge, messages, speed, cuts=cuts)
+        lasts = (messages[-1].time - messages[0].time) / 1e9 / speed
+        assert player.done.wait(PATIENCE + 2 * lasts)
         time.sleep(1.0)
         process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=PATIENCE)
@@ -116,6 +143,24 @@ def session(bridge, config: Path, folder: Path, entries: list[Entry], speed: flo
     assert process.returncode == 130, told
     assert "Traceback" not in told
     return json.loads((folder / "live.json").read_text())
+
+
+def maps_alike(folder: Path, again: Path) -> None:
+    """Runs a session's own configuration again; the maps must be the same, to the bit."""
+    assert main(["run", str(folder / "config.yaml"), "-o", str(again)]) == 0
+    for name in SAME:
+        assert (folder / name).read_bytes() == (again / name).read_bytes(), name
+
+
+def maps_of_file(folder: Path, config: Path, bag: Path, again: Path) -> None:
+    """Runs the configuration of a session on the bag that was played; its first steps, but for those whose
+    odometry was missing at the end, must be those of the session, to the bit."""
+    settings = ["live=null", f"recording.file={bag}", "session.reserve=8208"]
+    given = [word for setting in settings for word in ("--set", setting)]
+    assert main(["run", str(config), "-o", str(again), *given]) == 0
+    for name in ("online.tum", "steps.csv"):
+        mapped, whole = ((run / name).read_bytes() for run in (folder, again))
+        assert whole.startswith(mapped[: mapped.rfind(b"\n", 0, -1)]), name
 
 
 @pytest.mark.parametrize(
@@ -129,14 +174,14 @@ def test_the_map_of_a_session_is_that_of_the_file_and_of_its_recording(
     entries, robot = rounds(count), PlainBridge(loopback, KINDS)
     config = tmp_path / "robot.yaml"
     try:
-        player = Player(robot, rounds(0.2), 1.0, endless=True)
+        player = Player(robot, written(rounds(0.2)), 1.0, endless=True)
         text = said(capsys, "topics", robot.address, "-o", config, "--seconds", "2")
         assert "/scan" in text
         assert "serves as" in text
         assert f"python -m ratslam live {config}" in text
         player.done.set()
         report = session(
-            robot, config, tmp_path / "live", entries, speed, "--set", "live.topics.publish=true"
+            robot, config, tmp_path / "live", written(entries), speed, "--set", "live.topics.publish=true"
         )
         published = {topic for topic, _, _ in robot.published}
     finally:
@@ -151,36 +196,34 @@ def test_the_map_of_a_session_is_that_of_the_file_and_of_its_recording(
     link = next(content for topic, _, content in reversed(robot.published) if topic == "/tf")
     (moved,) = ROS2.deserialize_cdr(link, "tf2_msgs/msg/TFMessage").transforms
     assert (moved.header.frame_id, moved.child_frame_id) == ("map", "odom")
-    assert main(["run", str(tmp_path / "live" / "config.yaml"), "-o", str(tmp_path / "again")]) == 0
-    for name in SAME:
-        assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+    maps_alike(tmp_path / "live", tmp_path / "again")
     (tmp_path / "bag").mkdir()
     bag = write_bag(tmp_path / "bag", "mcap", entries)
-    settings = ["live=null", f"recording.file={bag}", "session.reserve=8208"]
-    assigned = [word for setting in settings for word in ("--set", setting)]
-    assert main(["run", str(config), "-o", str(tmp_path / "file"), *assigned]) == 0
-    for name in ("online.tum", "steps.csv"):
-        mapped, whole = ((tmp_path / run / name).read_bytes() for run in ("live", "file"))
-        assert whole.startswith(mapped[: mapped.rfind(b"\n", 0, -1)]), name
+    maps_of_file(tmp_path / "live", config, bag, tmp_path / "file")
     closures = (tmp_path / "again" / "closures.csv").read_text().splitlines()
     assert len(closures) > 1  # the second round is recognised
 
 
-@pytest.mark.soak
-def test_a_session_goes_on_with_a_map_and_localises_in_one(loopback, tmp_path):
-    entries, robot = rounds(1.2), SdkBridge(loopback, KINDS)
-    config = tmp_path / "robot.yaml"
+def configured(folder: Path, address: str) -> Path:
+    """The configuration of a session of `rounds`."""
+    config = folder / "robot.yaml"
     config.write_text(
-        f"live: {{topics: {{source: '{robot.address}'}}}}\n"
+        f"live: {{topics: {{source: '{address}'}}}}\n"
         "recording: {topics: {odometry: /odom, views: {topic: /scan, max_range: 8.0}, samples: views}}\n"
         "pose_cells: {cells_xy: 61, cell_size: 0.62}\nrecall: {sector_fov: 6.2832}\n"
     )
+    return config
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("bridge", [SdkBridge, ZenohRobot])
+def test_a_session_goes_on_with_a_map_and_localises_in_one(bridge, loopback, tmp_path):
+    messages, robot = written(rounds(1.2)), bridge(loopback, KINDS)
+    config = configured(tmp_path, robot.address)
     try:
-        first = session(robot, config, tmp_path / "first", entries, 20.0)
-        on = session(robot, config, tmp_path / "on", entries, 20.0, "--continue", str(tmp_path / "first"))
-        there = session(
-            robot, config, tmp_path / "there", entries, 20.0, "--localise", str(tmp_path / "first")
-        )
+        first = session(robot, config, tmp_path / "first", messages, 20.0)
+        on = session(robot, config, tmp_path / "on", messages, 20.0, "--continue", tmp_path / "first")
+        there = session(robot, config, tmp_path / "there", messages, 20.0, "--localise", tmp_path / "first")
     finally:
         robot.close()
     assert first["views"] == on["views"] == there["views"]
@@ -190,6 +233,63 @@ def test_a_session_goes_on_with_a_map_and_localises_in_one(loopback, tmp_path):
         assert (tmp_path / "on" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
     steps = (tmp_path / "there" / "steps.csv").read_text().splitlines()
     assert len(steps) == there["views"] + 1
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("number", range(20))
+def test_any_session_is_that_of_its_recording(number, loopback, tmp_path):
+    """At several speeds, beside busy processes, over connections that are cut; at the usual settings, so that
+    views are dropped."""
+    random = np.random.default_rng(number)
+    speed, busy, cuts = (5.0, 1.0, 20.0, 10.0)[number % 4], number % 3, (0, 20, 5)[number // 2 % 3]
+    messages, robot = written(rounds(1.3 if speed > 1 else 0.5)), PlainBridge(loopback, KINDS)
+    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
+    try:
+        config, moments = configured(tmp_path, robot.address), random.integers(1, len(messages), cuts)
+        report = session(
+            robot, config, tmp_path / "live", messages, speed, settings=(), cuts=moments.tolist()
+        )
+    finally:
+        robot.close()
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+    words = [speed, busy, cuts, report["views"], report["dropped"], report["outages"], report["pieces"]]
+    print("speed, busy, cuts, views, dropped, outages, pieces:", *words)
+    assert report["views"] > 20
+    maps_alike(tmp_path / "live", tmp_path / "again")
+
+
+OTHERS = os.environ.get("RATSLAM_BAGS", "")
+BAGS = ["turtlebot4_first_floor", *filter(None, OTHERS.split(os.pathsep))]
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("number", range(10))
+@pytest.mark.parametrize("name", BAGS)
+def test_a_bag_that_is_played_gives_the_map_of_the_file(
+    name, number, reference_data, loopback, tmp_path, capsys
+):
+    """In real time; on a machine that does nothing else, because a dropped view is another map."""
+    bag = reference_data / "bags" / name
+    with AnyReader([bag], default_typestore=ROS2) as reader:
+        connections = [each for each in reader.connections if each.msgtype in ROS2.fielddefs]
+        kinds = {each.topic: each.msgtype for each in connections}
+        messages = [Message(at, each.topic, bytes(raw)) for each, at, raw in reader.messages(connections)]
+    robot, config = PlainBridge(loopback, kinds), tmp_path / "robot.yaml"
+    try:
+        player = Player(robot, messages, 1.0, endless=True)
+        said(capsys, "topics", robot.address, "-o", config, "--seconds", "4")
+        player.done.set()
+        report = session(robot, config, tmp_path / "live", messages, 1.0, settings=())
+    finally:
+        robot.close()
+    print(report["views"], report["dropped"], report["latency_s"], config.read_text())
+    maps_alike(tmp_path / "live", tmp_path / "again")
+    assert not {"odometry late", "mapper late"} & set(report["dropped"])
+    maps_of_file(tmp_path / "live", config, bag, tmp_path / "file")
 
 
 MINUTES = os.environ.get("RATSLAM_TOPICS_MINUTES", "10")
@@ -230,13 +330,7 @@ def test_ten_minutes_lose_no_message_and_wait_for_none(loopback, tmp_path):
     command = [sys.executable, "-c", PLAYS, loopback, MINUTES]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, cwd=ROOT, **pipes) as robot:
-        address = robot.stdout.readline().strip()
-        config = tmp_path / "robot.yaml"
-        config.write_text(
-            f"live: {{topics: {{source: '{address}'}}}}\n"
-            "recording: {topics: {odometry: /odom, views: {topic: /scan, max_range: 8.0}, samples: views}}\n"
-            "pose_cells: {cells_xy: 61, cell_size: 0.62}\nrecall: {sector_fov: 6.2832}\n"
-        )
+        config = configured(tmp_path, robot.stdout.readline().strip())
         process = start("live", config, "-o", tmp_path / "live")
         while not (tmp_path / "live" / "session.mcap").exists():
             assert process.poll() is None, process.communicate()
@@ -284,7 +378,7 @@ def test_what_cannot_be_mapped_is_refused_before_a_session(loopback, tmp_path, c
             assert not (tmp_path / "run").exists()
         config.write_text(live + "recording: {topics: {odometry: /odom, views: /scan, samples: views}}\n")
         assert "a live session" in refused(capsys, "run", config, "-o", tmp_path / "run")
-        player = Player(robot, rounds(0.2), 1.0, endless=True)
+        player = Player(robot, written(rounds(0.2)), 1.0, endless=True)
         assert "can start" in said(capsys, "doctor", "--live", config)
         player.done.set()
     finally:

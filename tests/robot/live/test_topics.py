@@ -1,9 +1,8 @@
 """Topics of a running robot: samples as of a bag, to the bit; what a connection and a robot can do wrong."""
 
-import ssl
-import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.drivers.outcome import SessionOutcome
-from robot.live.foxglove import FoxgloveClient
 from robot.live.live_config import LiveConfig, TopicsLiveConfig
 from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
@@ -23,7 +21,6 @@ from robot.recordings.mcap_reader import Recording
 from robot.recordings.mcap_writer import Recorder
 from robot.recordings.recording_config import RecordingConfig
 from robot.sources.source import SourceDescription
-from tactile.base.errors import InputError
 from tests.helpers.ros_bags import (
     ROS2,
     Entry,
@@ -37,7 +34,7 @@ from tests.helpers.ros_bags import (
     transform,
     write_bag,
 )
-from tests.helpers.stand_in_robot import PlainBridge, SdkBridge
+from tests.helpers.stand_in_robot import PlainBridge, SdkBridge, ZenohRobot
 
 START = 1_700_000_000_123_456_789
 KINDS = {"/odom": "nav_msgs/msg/Odometry", "/scan": "sensor_msgs/msg/LaserScan"}
@@ -248,6 +245,20 @@ def test_a_clock_that_is_set_back_ends_the_session_and_one_set_ahead_does_not():
     assert set(told) <= {"gap", "dropped", "piece"}
 
 
+@pytest.mark.parametrize("stamp", [0.0, 5.0])
+def test_messages_without_stamps_of_their_own_name_the_other_clock(stamp):
+    at = {"sec": int(stamp), "nanosec": 0}
+    entries = [
+        entry._replace(fields={**entry.fields, "header": {**entry.fields["header"], "stamp": at}})
+        for entry in drive(3.0)
+    ]
+    with pytest.raises(SessionFault, match=r"recording\.topics\.clock=bag") as raised:
+        events_of(entries)
+    assert raised.value.fault.outcome is SessionOutcome.TOPIC_UNUSABLE
+    _, found = events_of(entries, clock="bag")
+    assert len(found) > 20
+
+
 class Listening:
     """A mapper that only listens."""
 
@@ -298,8 +309,17 @@ class Session:
             if self.recorder is not None:
                 self.recorder.close()
 
-    def close(self) -> None:
-        self.rig.client.close()
+
+@contextmanager
+def session_on(robot, *arguments, **settings) -> Iterator[Session]:
+    """A session that has subscribed to the topics of a robot; both are closed afterwards."""
+    try:
+        session = Session(robot.address, *arguments, **settings)
+        with session.rig:
+            wait(lambda: robot.heard(list(KINDS)))
+            yield session
+    finally:
+        robot.close()
 
 
 def wait(done: Callable[[], bool]) -> None:
@@ -325,16 +345,11 @@ def paced(bridge, entries, then: Callable[[], bool] = lambda: True):
     return act
 
 
-@pytest.mark.parametrize("bridge", [SdkBridge, PlainBridge])
+@pytest.mark.parametrize("bridge", [SdkBridge, PlainBridge, ZenohRobot])
 def test_a_session_records_every_message_and_the_samples_that_were_mapped(bridge, loopback, tmp_path):
     entries, robot = drive(10.0), bridge(loopback, KINDS | {"/imu": "sensor_msgs/msg/Imu"})
-    session = Session(robot.address, tmp_path / "session.mcap", max_wait=30.0)
-    try:
-        wait(lambda: robot.heard(list(KINDS)))
+    with session_on(robot, tmp_path / "session.mcap", max_wait=30.0) as session:
         session.run(paced(robot, entries))
-    finally:
-        session.close()
-        robot.close()
     mapped = session.mapper.samples
     assert bits(mapped) == bits(Recording(tmp_path / "session.mcap"))
     whole = write_bag(tmp_path, "mcap", entries)
@@ -348,13 +363,8 @@ def test_a_session_records_every_message_and_the_samples_that_were_mapped(bridge
 
 def test_channels_of_ros_1_are_recorded_as_those_of_ros_2(loopback, tmp_path):
     entries, robot = drive(3.0), PlainBridge(loopback, KINDS, ros1=True)
-    session = Session(robot.address, tmp_path / "session.mcap", max_wait=30.0)
-    try:
-        wait(lambda: robot.heard(list(KINDS)))
+    with session_on(robot, tmp_path / "session.mcap", max_wait=30.0) as session:
         session.run(paced(robot, entries))
-    finally:
-        session.close()
-        robot.close()
     found = bits(session.mapper.samples)
     assert found == bits(samples_of(recording(), entries))[: len(found)]
     again = open_recording(recording().model_copy(update={"file": tmp_path / "session.mcap"}))
@@ -362,9 +372,9 @@ def test_channels_of_ros_1_are_recorded_as_those_of_ros_2(loopback, tmp_path):
     assert len(found) > 20
 
 
-def test_a_connection_cut_again_and_again_loses_no_recording(loopback, tmp_path):
-    robot, random = PlainBridge(loopback, KINDS), np.random.default_rng(5)
-    session = Session(robot.address, tmp_path / "session.mcap", max_wait=0.05)
+@pytest.mark.parametrize("bridge", [PlainBridge, ZenohRobot])
+def test_a_connection_cut_again_and_again_loses_no_recording(bridge, loopback, tmp_path):
+    robot, random = bridge(loopback, KINDS), np.random.default_rng(5)
     rest = drive(30.0)
     cuts = sorted(random.integers(100, 1400, 8).tolist(), reverse=True)
 
@@ -381,12 +391,8 @@ def test_a_connection_cut_again_and_again_loses_no_recording(loopback, tmp_path)
         del rest[:20]
         return True
 
-    try:
-        wait(lambda: robot.heard(list(KINDS)))
+    with session_on(robot, tmp_path / "session.mcap", max_wait=0.05) as session:
         session.run(act)
-    finally:
-        session.close()
-        robot.close()
     assert session.rig.outages == 8
     read = Recording(tmp_path / "session.mcap")
     assert bits(session.mapper.samples) == bits(read)
@@ -395,9 +401,39 @@ def test_a_connection_cut_again_and_again_loses_no_recording(loopback, tmp_path)
     assert read.begins == {k for k, begins in enumerate(session.mapper.begun) if begins}
 
 
+@pytest.mark.parametrize("bridge", [PlainBridge, ZenohRobot])
+@pytest.mark.parametrize("kind", [KINDS["/scan"], "sensor_msgs/msg/Imu"], ids=["same", "other"])
+def test_a_topic_that_vanishes_is_heard_again_unless_its_type_has_changed(bridge, kind, loopback):
+    robot, entries = bridge(loopback, KINDS), drive(6.0)
+    half, vanished, stage = len(entries) // 2, [0], iter((0, 1))
+    first, second = paced(robot, entries[:half]), paced(robot, entries[half:], lambda: same)
+    same = kind == KINDS["/scan"]
+
+    def act(count: int) -> bool:
+        if first(count):
+            return True
+        if next(stage, 1) == 0:
+            robot.withdraw("/scan")
+            vanished[0] = count
+            return True
+        if "/scan" in session.rig.client.channels and not vanished[0]:
+            return second(count)
+        if vanished[0] and "/scan" not in session.rig.client.channels:
+            vanished[0] = 0
+            robot.advertise("/scan", kind)
+        return True
+
+    with session_on(robot, max_wait=30.0, patience=3.0) as session:
+        if same:
+            session.run(act)
+            assert len(session.mapper.samples) > 50
+            return
+        with pytest.raises(SessionFault, match=f"advertised as {kind} now, not as {KINDS['/scan']}"):
+            session.run(act)
+
+
 def test_what_a_robot_sends_amiss_is_named_and_left_out(loopback, tmp_path):
     robot = PlainBridge(loopback, KINDS)
-    session = Session(robot.address, tmp_path / "session.mcap", max_wait=30.0)
     amiss = iter([
         lambda: robot.say(b"\x01\x00"), lambda: robot.say("{"), lambda: robot.say('{"op": "advertise"}'),
         lambda: robot.send_raw("/scan", b"\x00\x01\x00\x00garbage"), lambda: robot.send_raw("/odom", b""),
@@ -409,12 +445,8 @@ def test_what_a_robot_sends_amiss_is_named_and_left_out(loopback, tmp_path):
         next(amiss, lambda: None)()
         return send(count)
 
-    try:
-        wait(lambda: robot.heard(list(KINDS)))
+    with session_on(robot, tmp_path / "session.mcap", max_wait=30.0) as session:
         session.run(act)
-    finally:
-        session.close()
-        robot.close()
     assert len(session.mapper.samples) > 70
     assert session.rig.spoilt["/scan"] == session.rig.spoilt["/odom"] == 1
     assert session.rig.spoilt["connection"] >= 4
@@ -425,7 +457,6 @@ def test_what_a_robot_sends_amiss_is_named_and_left_out(loopback, tmp_path):
 @pytest.mark.parametrize("name", ["gone", "silent", "useless"])
 def test_what_does_not_end_ends_the_session(name, loopback):
     robot = PlainBridge(loopback, KINDS)
-    session = Session(robot.address, patience=0.5 if name != "useless" else 60.0)
     send = paced(robot, drive(2.0))
 
     def act(count: int) -> bool:
@@ -441,69 +472,21 @@ def test_what_does_not_end_ends_the_session(name, loopback):
         "gone": SessionOutcome.CONNECTION_LOST, "silent": SessionOutcome.TOPIC_SILENT,
         "useless": SessionOutcome.TOPIC_UNUSABLE,
     }[name]  # fmt: skip
-    try:
-        wait(lambda: robot.heard(list(KINDS)))
+    with session_on(robot, patience=0.5 if name != "useless" else 60.0) as session:
         with pytest.raises(SessionFault) as raised:
             session.run(act)
         assert raised.value.fault.outcome is expected
-    finally:
-        session.close()
-        robot.close()
 
 
 def test_a_mapper_that_lags_drops_views_and_no_motion(loopback):
     robot, entries = PlainBridge(loopback, KINDS), drive(6.0)
-    session = Session(robot.address, max_wait=30.0)
-    session.mapper.lag = lambda: 9.0 if len(session.mapper.samples) % 3 == 2 and next(dropping) else 0.0
     dropping = iter([True] * 20 + [False] * 100_000)
-    try:
-        wait(lambda: robot.heard(list(KINDS)))
+    with session_on(robot, max_wait=30.0) as session:
+        session.mapper.lag = lambda: 9.0 if len(session.mapper.samples) % 3 == 2 and next(dropping) else 0.0
         session.run(paced(robot, entries))
-    finally:
-        session.close()
-        robot.close()
     assert session.rig.steps.dropped["mapper late"] == 20
     whole = samples_of(recording(), entries)
     total = sum(float(sample.reading.odometry.dtheta) for sample in whole)
     assert sum(float(s.reading.odometry.dtheta) for s in session.mapper.samples) == pytest.approx(
         total, abs=1e-9
     )
-
-
-def test_the_client_connects_only_where_it_is_told_and_bounds_what_it_takes(loopback):
-    with pytest.raises(InputError, match="no connection"):
-        FoxgloveClient(f"ws://{loopback}:9", lambda channel: True)
-    with pytest.raises(InputError, match="no address of a websocket"):
-        FoxgloveClient("robot:8765", lambda channel: True)
-    robot = PlainBridge(loopback, KINDS)
-    client = FoxgloveClient(robot.address, lambda channel: channel.topic == "/scan")
-    try:
-        wait(lambda: robot.heard(["/scan"]))
-        robot.send_raw("/scan", b"x" * (1 << 27))
-        assert [item.name for item in client.take(PATIENCE)] == ["lost"]
-    finally:
-        client.close()
-        robot.close()
-
-
-def test_a_connection_with_tls_needs_a_certificate_that_is_trusted(loopback, tmp_path, monkeypatch):
-    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
-    made = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=robot"]
-    made += ["-addext", f"subjectAltName=IP:{loopback}", "-keyout", str(key), "-out", str(certificate)]
-    subprocess.run(made, check=True, capture_output=True)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(certificate, key)
-    robot = PlainBridge(loopback, KINDS, ssl=context)
-    try:
-        with pytest.raises(InputError, match="no trusted connection"):
-            FoxgloveClient(robot.address, lambda channel: True)
-        monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
-        client = FoxgloveClient(robot.address, lambda channel: True)
-        try:
-            wait(lambda: robot.heard(list(KINDS)))
-            robot.send(drive(0.1)[0])
-            assert [item.channel.topic for item in client.take(PATIENCE)] == ["/odom"]
-        finally:
-            client.close()
-    finally:
-        robot.close()
