@@ -31,7 +31,7 @@ CHUNK = 16
 """Observations per compiled call. Capacity and map feedback change only at multiples of it."""
 MOST_STATE = 1 << 30
 """Largest state of a new session, bytes."""
-LAP, REHEARSED = 24, 96
+LAP, REHEARSED = 40, 140
 """Steps of a lap of a rehearsal, and steps in all."""
 UNKNOWN = -1
 """`Session.earlier` after a checkpoint of an early version, which does not hold it."""
@@ -175,12 +175,12 @@ class Session:
         self.state = self.backend.apply_map_feedback(self.state, self.map.feedback())
         self._compute(allocate(self._layout, CHUNK), 0)
 
-    def rehearse(self, like: Observation, seed: int = 0) -> None:
-        """Drives laps of a circle with views that come again, and goes back to the start (`restart`): the
-        kernel is compiled for observations like this one, and so is what the map computes at its first
-        closures. A live session would else wait for it, and drop views, while the robot moves."""
+    def rehearse(self, like: Observation, pace: float, seed: int = 0) -> None:
+        """Drives laps of a circle with views that come again, `pace` m a step, and goes back to the start
+        (`restart`): the kernel is compiled for observations like this one, and so is what the map computes at
+        its first closures. Else a live session waits for that, and drops views, while the robot moves."""
         views = np.random.default_rng(0).random((LAP, *like.view.shape))
-        ahead = Odometry(*map(np.float64, (0.05, 0.0, 2 * np.pi / LAP, 0.1)))
+        ahead = Odometry(*map(np.float64, (pace, 0.0, 2 * np.pi / LAP, 1.0)))
         for k in range(REHEARSED):
             self.step(like._replace(odometry=ahead, view=views[k % LAP], view_seen=np.True_))
         self.restart(seed)

@@ -273,7 +273,7 @@ def _map(line: Connection) -> None:
         check_finished_map(config, source)
         session = build_session(config, source)
         like = observation(NO_ODOMETRY, view_shape=source.view_shape, whiskers=source.whiskers)
-        session.rehearse(like, config.session.seed)
+        session.rehearse(like, config.pose_cells.cell_size, config.session.seed)
         gc.collect()
         gc.freeze()  # what compiling has left need not be searched again: a full collection takes 0.1 s
         line.send(True)

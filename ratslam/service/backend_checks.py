@@ -349,6 +349,7 @@ class BackendTrial(Trial[BackendEntry]):
     def warms_up(self) -> None:
         session = Session(self.backend)
         first, *_ = self.walk(1)
+        session.rehearse(first, 0.05)
         session.warm(first)
         require(session.steps == 0, f"{session.steps} steps after warming up", "none")
         found = [session.step(o) for o in self.walk(SHORT)]

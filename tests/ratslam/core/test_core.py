@@ -204,3 +204,51 @@ def test_every_flag_is_set_once_and_a_value_of_the_user_stays(given: str) -> Non
     assert sorted(add_xla_flags(given).split()) == sorted(FLAGS)
     own = "--xla_cpu_multi_thread_eigen=true --xla_dump_to=folder"
     assert add_xla_flags(own).split() == [*own.split(), FLAGS[1]]
+
+
+REHEARSED = """
+import logging, sys
+import jax
+from numba.core.dispatcher import Dispatcher
+from ratslam.runs.build_session import build_session, open_source, resolve_config
+from ratslam.runs.settings.completion import complete
+from robot.sources.in_memory import NO_ODOMETRY
+from robot.touch_source import observation_of, open_touch_source
+from tactile.base.types import observation
+
+def compiled():
+    modules = [module for name, module in sys.modules.items() if name.startswith("ratslam.mapping")]
+    values = [value for module in modules for value in vars(module).values()]
+    return {str(each): len(each.signatures) for each in values if isinstance(each, Dispatcher)}
+
+class Kernels(logging.Handler):
+    found = []
+
+    def emit(self, record):
+        self.found += [record.getMessage()] if record.getMessage().startswith("Compiling") else []
+
+logging.getLogger("jax").addHandler(Kernels())
+jax.config.update("jax_log_compiles", True)
+config = resolve_config("whisker_maze")
+with open_source(config) as source:
+    config = complete(config, source)
+    source = open_touch_source(source, config.touch)
+    session = build_session(config, source)
+    like = observation(NO_ODOMETRY, view_shape=source.view_shape, whiskers=source.whiskers)
+    session.rehearse(like, config.pose_cells.cell_size, config.session.seed)
+    before, kernels = compiled(), len(Kernels.found)
+    for _, sample in zip(range(230), source):
+        session.step(observation_of(sample))
+print(len(session.map.closures()), kernels, Kernels.found[kernels:], compiled() == before, sum(before.values()))
+"""
+
+
+def test_after_a_rehearsal_the_first_closures_compile_nothing():
+    """In a process of its own: others have compiled already."""
+    done = subprocess.run([sys.executable, "-c", REHEARSED], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    closures, kernels, later, same, functions = done.stdout.split()
+    assert int(closures) > 5
+    assert int(kernels) > 0
+    assert (later, same) == ("[]", "True")
+    assert int(functions) > 10

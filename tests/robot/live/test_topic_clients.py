@@ -82,7 +82,7 @@ def test_a_robot_on_zenoh_is_heard_in_its_domain_and_what_it_keeps_is_repeated(h
         client = open_client(robot.address, lambda channel: channel.topic != "/scan")
         try:
             wait(lambda: robot.heard(["/odom"]))
-            assert {each.topic: each.kind for each in client.channels.values()} == KINDS | STATIC
+            wait(lambda: {each.topic: each.kind for each in client.channels.values()} == KINDS | STATIC)
             assert client.name == "rmw_zenoh, domain 3"
             wheels = drive(1.0)
             robot.send(*wheels)
