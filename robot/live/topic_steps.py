@@ -43,8 +43,6 @@ TURN_LENGTH = 0.5
 """A turn counts as this much way, m/rad, where poses are compared."""
 RESTART = 3.0
 """Time that a robot may have driven before the first message of an odometry that began anew, s."""
-RENEWED = 16
-"""Messages after which the usual time between them is found anew."""
 SLOWEST, FEW = 0.05, 20
 """Speed that any robot may have, m/s; messages after which its own speed is known."""
 WAITING = 256
@@ -180,7 +178,7 @@ class OdometryTrack:
         self._paths: tuple[_Path, ...] = (_Path(), _Path()) if every > 1 else (_Path(),)
         self._joined, self._newest = np.zeros(3), np.zeros(3)  # poses of the last joined row and message
         self._steps = deque[float](maxlen=101)
-        self._fastest, self._usual = 0.0, np.inf  # speed, m/s, and time between messages, s
+        self._fastest = 0.0  # m/s
         self._heading = self._turns = 0.0  # of the newest row; whole turns to add to it, rad
 
     @property
@@ -200,14 +198,15 @@ class OdometryTrack:
         new, last = np.array(value), self._time
         motion, event = np.zeros(3), ("", "")
         if last is not None:
-            event = self._judge(time - last, new, outage)
+            step = None if self.held else between(self._value, new)
+            event = self._judge(time - last, step, new, outage)
             if event[0] == PIECE:
                 self.piece += 1
-            elif self.held:
+            elif step is None:
                 forward, left, turn = np.array([self._value, new]).T
                 motion = from_velocities(np.array([last, time]), forward, left, turn)[1, :3]
             else:
-                motion = between(self._value, new)
+                motion = step
             self._steps.append(time - last)
         self._time, self._value = time, new
         pose = self._newest = self._paths[0].add(motion)
@@ -254,16 +253,18 @@ class OdometryTrack:
         while self.rows[0].time < time - HISTORY:
             self.rows.popleft()
 
-    def _judge(self, dt: float, new: np.ndarray, outage: bool) -> tuple[str, str]:
-        """Whether the odometry goes on: the name of an event and what was found."""
-        if self._count % RENEWED == 0 or len(self._steps) < RENEWED:
-            self._usual = float(np.median(self._steps)) if len(self._steps) > 3 else np.inf
-        gap = dt > max(GAP * self._usual, LEAST_GAP)
-        if self.held:
+    def _judge(self, dt: float, step: np.ndarray | None, new: np.ndarray, outage: bool) -> tuple[str, str]:
+        """Whether the odometry goes on: the name of an event and what was found.
+
+        Args:
+            step: [3] motion between poses, None of velocities.
+        """
+        usual = sorted(self._steps)[len(self._steps) // 2] if len(self._steps) > 3 else np.inf
+        gap = dt > max(GAP * usual, LEAST_GAP)
+        if step is None:
             if not gap:
                 return "", ""
             return PIECE, f"no velocities for {dt:.3g} s: nobody knows how the robot moved meanwhile"
-        step = between(self._value, new)
         length = float(np.hypot(*step[:2]))
         pace = length / dt
         if gap or outage:

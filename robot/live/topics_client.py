@@ -16,6 +16,8 @@ LARGEST = 1 << 26
 """Largest message that is accepted, bytes."""
 WAITING = 4096
 """Messages that may wait to be taken; then the client reads no further."""
+FULL = 0.01
+"""Period at which room for more messages is looked for, s."""
 MOST_TOPICS = 10_000
 """Topics of a robot of which more are ignored."""
 CONNECT_TIMEOUT = 5.0
@@ -79,7 +81,7 @@ class TopicsClient:
         self.address, self._wanted = address, wanted
         self.channels: dict[str, Channel] = {}
         self.name, self.accepts = "", tuple[str, ...]()
-        self._taken: queue.Queue[Received | Notice] = queue.Queue(WAITING)
+        self._taken: queue.SimpleQueue[Received | Notice] = queue.SimpleQueue()
         self._closed = threading.Event()
 
     def want(self, wanted: Wanted) -> None:
@@ -114,10 +116,9 @@ class TopicsClient:
 
     def _put(self, item: Received | Notice) -> None:
         """Hands on what came; waits while there is no room."""
-        while not self._closed.is_set():
-            with suppress(queue.Full):
-                self._taken.put(item, timeout=0.1)
-                return
+        while self._taken.qsize() >= WAITING and not self._closed.wait(FULL):
+            pass
+        self._taken.put(item)
 
 
 def open_client(address: str, wanted: Wanted) -> TopicsClient:

@@ -38,6 +38,8 @@ DISCOVERY = 5.0
 """Time within which a robot must advertise its topics, s."""
 FIRST = 10.0
 """Time within which a topic must send its first message, s."""
+LONGEST_WAIT = 0.05
+"""Time after which what is missing is looked at, if no message comes, s."""
 FEW = 20
 """Messages of a topic that may be unusable, however few there are."""
 
@@ -297,7 +299,7 @@ def run_topics_loop(rig: TopicsRig, mapper: AsyncMapper, tell: Tell) -> None:
     """
     budget = rig.config.budget
     while not rig.over():
-        taken: list[Received | Notice | None] = [*rig.client.take(TICK)]
+        taken: list[Received | Notice | None] = [*rig.client.take(LONGEST_WAIT)]
         for item in taken or [None]:
             arrival = 0
             if item is not None:

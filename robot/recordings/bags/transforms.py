@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable
 from itertools import compress
@@ -46,7 +47,7 @@ def pose_in_plane(position: Vector, turn: Quaternion, where: str, plane: str = "
         raise InputError(where, "the orientation is 0, 0, 0, 0", "a unit quaternion", cure)
     place = tuple(position["xyz".index(axis)] for axis in plane)
     for name, values in (("orientation", turn), ("position", place)):
-        if not np.isfinite(values).all():
+        if not all(map(math.isfinite, values)):
             raise InputError(where, f"the {name} is {', '.join(map(str, values))}", "finite numbers")
     x, y, z, w = turn
     if plane == "xz":
@@ -284,7 +285,7 @@ def value_of(config: PoseTopic, kind: str, content: Any, place: str) -> Vector |
     if not holds_velocities(config, kind):
         return pose_in_plane(*POSES[kind](content), place, config.plane)
     value = twist_in_plane(TWISTS[kind](content))
-    if not np.isfinite(value).all():
+    if not all(map(math.isfinite, value)):
         raise InputError(place, f"the velocities are {', '.join(map(str, value))}", "finite numbers")
     return value
 
