@@ -239,7 +239,8 @@ with open_source(config) as source:
     before, kernels = compiled(), len(Kernels.found)
     for _, sample in zip(range(230), source):
         session.step(observation_of(sample))
-print(len(session.map.closures()), kernels, Kernels.found[kernels:], compiled() == before, sum(before.values()))
+later = Kernels.found[kernels:]
+print(len(session.map.closures()), kernels, later, compiled() == before, sum(before.values()))
 """
 
 
