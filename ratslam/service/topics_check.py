@@ -11,7 +11,8 @@ from mcap.writer import Writer
 
 from ratslam.service.recording_check import Diagnosis, diagnose_recording
 from robot.live.topic_steps import ROLES, LiveMessages
-from robot.live.topics_client import Channel, Received, TopicsClient, open_client
+from robot.live.topics_client import Channel, Received, TopicsClient
+from robot.live.topics_rig import open_client
 from robot.recordings.bags.bag import TRANSFORMS
 from robot.recordings.bags.bag_description import BagDescription, TopicDescription, describe_bag
 from robot.recordings.bags.topics_config import TopicsConfig
@@ -22,8 +23,8 @@ from tactile.base.errors import InputError
 USED = TRANSFORMS.union(*ROLES.values())
 """Types of messages that are looked at."""
 NO_ODOMETRY = "no topic of odometry: odometry of /tf, or of images alone, is for bags"
-DISCOVERY = 2.0
-"""Time for which advertisements are awaited, s."""
+DISCOVERY, SETTLED = 2.0, 0.3
+"""Time for which advertisements are awaited, and after which no more are expected, s."""
 CLOCKS_DIFFER = 1.0
 """Age of stamps, or time by which they are ahead, from which the clocks of robot and host differ, s."""
 
@@ -40,7 +41,7 @@ def diagnose_topics(address: str, seconds: float) -> Diagnosis:
     messages = LiveMessages(address, TopicsConfig(), lambda sentence: None)
     client = open_client(address, lambda channel: False)
     try:
-        time.sleep(DISCOVERY if not client.channels else 0.2)
+        _await_topics(client)
         messages.list_topics(client.channels)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "heard.mcap"
@@ -50,6 +51,16 @@ def diagnose_topics(address: str, seconds: float) -> Diagnosis:
         return _of_robot(address, seconds, client, found, diagnosis, folder)
     finally:
         client.close()
+
+
+def _await_topics(client: TopicsClient) -> None:
+    """Waits until the robot has advertised its topics."""
+    due, known = time.monotonic() + DISCOVERY, 0
+    while time.monotonic() < due:
+        time.sleep(SETTLED)
+        if known and len(client.channels) == known:
+            return
+        known = len(client.channels)
 
 
 def _record(client: TopicsClient, messages: LiveMessages, path: Path, seconds: float) -> int:

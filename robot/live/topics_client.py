@@ -1,7 +1,4 @@
-"""A connection to the topics of a running robot: what every way to it has in common.
-
-`open_client` chooses by the address: the Foxglove protocol (`ws://`, `wss://`), or Zenoh (`zenoh://`).
-"""
+"""A connection to the topics of a running robot: what every way to it has in common."""
 
 from __future__ import annotations
 
@@ -119,18 +116,3 @@ class TopicsClient:
         while self._taken.qsize() >= WAITING and not self._closed.wait(FULL):
             pass
         self._taken.put(item)
-
-
-def open_client(address: str, wanted: Wanted) -> TopicsClient:
-    """Connects to a robot by the way that its address names.
-
-    Raises:
-        InputError: nothing answers at the address, or it is not one.
-    """
-    if address.startswith("zenoh"):
-        from robot.live.zenoh_client import ZenohClient
-
-        return ZenohClient(address, wanted)
-    from robot.live.foxglove import FoxgloveClient
-
-    return FoxgloveClient(address, wanted)

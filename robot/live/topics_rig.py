@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from robot.drivers.outcome import SessionOutcome
+from robot.live.foxglove import FoxgloveClient
 from robot.live.live_config import LiveConfig, TopicsLiveConfig
 from robot.live.polling import (
     TICK,
@@ -24,7 +25,8 @@ from robot.live.polling import (
     session_fault,
 )
 from robot.live.topic_steps import LiveMessages, TopicSteps, chosen_topics
-from robot.live.topics_client import Channel, Notice, Received, open_client
+from robot.live.topics_client import Channel, Notice, Received, TopicsClient, Wanted
+from robot.live.zenoh_client import ZenohClient
 from robot.recordings.bags.bag import TRANSFORMS, Topic
 from robot.recordings.bags.transforms import STATIC
 from robot.recordings.cdr import PIECE, Event
@@ -42,6 +44,16 @@ LONGEST_WAIT = 0.05
 """Time after which what is missing is looked at, if no message comes, s."""
 FEW = 20
 """Messages of a topic that may be unusable, however few there are."""
+
+
+def open_client(address: str, wanted: Wanted) -> TopicsClient:
+    """Connects to a robot by the way that its address names: Zenoh (`zenoh://`), else the Foxglove protocol.
+
+    Raises:
+        InputError: nothing answers at the address, or it is not one.
+    """
+    client: type[TopicsClient] = ZenohClient if address.startswith("zenoh") else FoxgloveClient
+    return client(address, wanted)
 
 
 def require_topics(live: TopicsLiveConfig, recording: RecordingConfig | None) -> RecordingConfig:
@@ -297,7 +309,7 @@ def run_topics_loop(rig: TopicsRig, mapper: AsyncMapper, tell: Tell) -> None:
     Raises:
         robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
     """
-    budget = rig.config.budget
+    budget, checked = rig.config.budget, 0.0
     while not rig.over():
         taken: list[Received | Notice | None] = [*rig.client.take(LONGEST_WAIT)]
         for item in taken or [None]:
@@ -314,5 +326,7 @@ def run_topics_loop(rig: TopicsRig, mapper: AsyncMapper, tell: Tell) -> None:
                 if arrival:
                     rig.latencies.append((time.time_ns() - arrival) / 1e9)
                 tell(sample.time, odometry)
-        rig.check_patience()
-        check_mapper(mapper)
+        if time.monotonic() - checked >= LONGEST_WAIT:
+            checked = time.monotonic()
+            rig.check_patience()
+            check_mapper(mapper)

@@ -13,7 +13,7 @@ import os
 import threading
 import time
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import urlsplit
 
 from robot.live.topics_client import (
@@ -37,22 +37,13 @@ TRANSIENT_LOCAL = "1"
 """Durability of publishers that repeat their last messages to those who come later."""
 
 
-class _Publisher(NamedTuple):
-    """What a liveliness token says of a publisher."""
-
-    topic: str
-    kind: str
-    hash: str
-    durability: str
-
-
 class ZenohClient(TopicsClient):
     """A connection to a router at `zenoh://HOST:PORT/DOMAIN`, or `zenoh+tls://`."""
 
     def __init__(self, address: str, wanted: Wanted) -> None:
         super().__init__(address, wanted)
         endpoint, self._domain = _parse(address)
-        self._publishers: dict[str, _Publisher] = {}  # by the key of their token
+        self._publishers: dict[str, tuple[Channel, str, str]] = {}  # by the key of their token
         self._subscribers: dict[str, Any] = {}  # by topic
         self._tokens: dict[str, tuple[str, Any]] = {}  # key and token of what is published, by topic
         self._sent = 0
@@ -65,11 +56,17 @@ class ZenohClient(TopicsClient):
 
     def publish(self, topic: str, kind: str, content: bytes) -> None:
         import zenoh
+        from zenoh.ext import Int64, z_serialize
 
         with self._lock, suppress(zenoh.ZError):
             if topic not in self._tokens:
                 self._tokens[topic] = self._announce(topic, kind, len(self._tokens))
-            self._session.put(self._tokens[topic][0], content, attachment=self._attachment())
+            self._sent += 1
+            number, now = Int64(self._sent), Int64(time.time_ns())
+            sender = bytes.fromhex(str(self._session.info.zid()).zfill(32))
+            # What `rmw_zenoh` expects beside a message.
+            beside = z_serialize(("sequence_number", number, "source_timestamp", now, "source_gid", sender))
+            self._session.put(self._tokens[topic][0], content, attachment=beside)
 
     def close(self) -> None:
         self._closed.set()
@@ -92,19 +89,17 @@ class ZenohClient(TopicsClient):
         publisher = _publisher_of(key)
         if publisher is None:
             return
+        topic = publisher[0].topic
         with self._lock:
             if token.kind == zenoh.SampleKind.DELETE:
                 self._publishers.pop(key, None)
             elif len(self._publishers) < MOST_TOPICS:
                 self._publishers[key] = publisher
-            found = list(enumerate(self._publishers.values()))
-            self.channels = {
-                each.topic: Channel(number, each.topic, "cdr", each.kind, "", "ros2msg")
-                for number, each in reversed(found)
-            }
-            gone = publisher.topic in self._subscribers and publisher.topic not in self.channels
+            found = [channel for channel, *_ in self._publishers.values()]
+            self.channels = {channel.topic: channel for channel in reversed(found)}
+            gone = topic in self._subscribers and topic not in self.channels
         if gone:  # the subscriber stays: it hears a publisher that comes back
-            self._note("vanished", f"{publisher.topic} is no longer advertised", publisher.topic)
+            self._note("vanished", f"{topic} is no longer advertised", topic)
         self._subscribe()
 
     def _subscribe(self) -> None:
@@ -124,7 +119,7 @@ class ZenohClient(TopicsClient):
 
         # The hash is left open: Humble writes none.
         key = f"{self._domain}/{channel.topic.strip('/')}/{_written(channel.kind)}/*"
-        kept = {each.durability for each in self._publishers.values() if each.topic == channel.topic}
+        kept = {durability for each, _, durability in self._publishers.values() if each == channel}
         if TRANSIENT_LOCAL not in kept:
             return self._session.declare_subscriber(key, receive)
         history = HistoryConfig(detect_late_publishers=True)
@@ -135,22 +130,13 @@ class ZenohClient(TopicsClient):
         from rosbags.typesys import Stores, get_typestore
 
         hashed = get_typestore(Stores.ROS2_HUMBLE).hash_rihs01(kind)
-        if any(each.hash == HUMBLE for each in self._publishers.values()):
+        if any(known == HUMBLE for _, known, _ in self._publishers.values()):
             hashed = HUMBLE
         written, mangled = _written(kind), topic.replace("/", "%")
         node = f"@ros2_lv/{self._domain}/{self._session.info.zid()}/0"
         said = f"{node}/{number + 1}/MP/%/%/ratslam/{mangled}/{written}/{hashed}/::,10:,:,:,,"
         token = self._session.liveliness().declare_token(said)
         return f"{self._domain}/{topic.strip('/')}/{written}/{hashed}", token
-
-    def _attachment(self) -> Any:
-        """What `rmw_zenoh` expects beside a message: its number, time and sender."""
-        from zenoh.ext import Int64, z_serialize
-
-        self._sent += 1
-        number, now = Int64(self._sent), Int64(time.time_ns())
-        sender = bytes.fromhex(str(self._session.info.zid()).zfill(32))
-        return z_serialize(("sequence_number", number, "source_timestamp", now, "source_gid", sender))
 
 
 def _parse(address: str) -> tuple[str, int]:
@@ -197,19 +183,19 @@ def _open(address: str, endpoint: str) -> Any:
         raise InputError(address, f"no connection ({words})", expected, START) from None
 
 
-def _publisher_of(key: str) -> _Publisher | None:
-    """The publisher that a token announces; None for nodes, subscribers and what else there is."""
+def _publisher_of(key: str) -> tuple[Channel, str, str] | None:
+    """The topic of the publisher that a token announces, with the hash of its type and its durability; None
+    for nodes, subscribers and what else there is."""
     parts = key.split("/")
     if len(parts) != 13 or parts[5] != "MP":
         return None
     topic, written, hashed, quality = parts[9:]
-    pieces = [*quality.split(":"), "", ""]
-    return _Publisher(topic.replace("%", "/"), _read(written), hashed, pieces[1])
-
-
-def _read(written: str) -> str:
-    """A type as messages name it, such as nav_msgs/msg/Odometry, from nav_msgs::msg::dds_::Odometry_."""
-    return written.replace("dds_::", "").replace("::", "/").removesuffix("_")
+    kind = written.replace("dds_::", "").replace("::", "/").removesuffix("_")
+    return (
+        Channel(0, topic.replace("%", "/"), "cdr", kind, "", "ros2msg"),
+        hashed,
+        f"{quality}::".split(":")[1],
+    )
 
 
 def _written(kind: str) -> str:

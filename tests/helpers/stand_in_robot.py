@@ -6,6 +6,7 @@ import socket
 import struct
 import threading
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import foxglove
@@ -178,17 +179,27 @@ class ZenohRobot:
 
     Args:
         kinds: type of each topic; `/tf_static` is repeated to those who come later. domain: of ROS 2.
-            humble: whether types have no hashes.
+            humble: whether types have no hashes. secrets: files of a key and a certificate, for TLS.
 
     Attributes:
         published: messages of clients, as (topic, type, bytes); beside them, what came with each.
     """
 
-    def __init__(self, host: str, kinds: Mapping[str, str], *, domain: int = 0, humble: bool = False) -> None:
+    def __init__(
+        self, host: str, kinds: Mapping[str, str], *, domain: int = 0, humble: bool = False,
+        secrets: tuple[Path, Path] | None = None,
+    ) -> None:  # fmt: skip
         with socket.socket() as probe:
             probe.bind((host, 0))
-            self._endpoint = f"tcp/{host}:{probe.getsockname()[1]}"
-        self.address = f"zenoh://{self._endpoint[4:]}/{domain}"
+            there = f"{host}:{probe.getsockname()[1]}"
+        self._endpoint = f"tls/{there}" if secrets else f"tcp/{there}"
+        self.address = f"zenoh{'+tls' if secrets else ''}://{there}/{domain}"
+        key, certificate = map(str, secrets or ("", ""))
+        self._secrets = {
+            "transport/link/tls/listen_private_key": key,
+            "transport/link/tls/listen_certificate": certificate,
+            "transport/link/tls/root_ca_certificate": certificate,
+        } if secrets else {}  # fmt: skip
         self.published: list[tuple[str, str, bytes]] = []
         self.beside: list[bytes] = []
         self._domain, self._humble = domain, humble
@@ -196,7 +207,7 @@ class ZenohRobot:
         self._publishers: dict[str, Any] = {}
         self._tokens: dict[str, Any] = {}
         self.route()
-        self._node = opened(**{"mode": "peer", "connect/endpoints": [self._endpoint]})
+        self._node = opened(**self._secrets, **{"mode": "peer", "connect/endpoints": [self._endpoint]})
         beginning = f"@ros2_lv/{domain}/{self._node.zid()}/0"
         alive = self._node.liveliness()
         self._others = [
@@ -249,8 +260,7 @@ class ZenohRobot:
 
     def route(self) -> None:
         """Starts the router."""
-        settings = {"mode": "router", "listen/endpoints": [self._endpoint]}
-        self._router = opened(**settings)
+        self._router = opened(**self._secrets, **{"mode": "router", "listen/endpoints": [self._endpoint]})
 
     def cut(self) -> None:
         """Breaks all connections: the router ends and starts anew."""

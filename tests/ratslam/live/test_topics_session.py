@@ -303,7 +303,7 @@ from tests.ratslam.live.test_topics_session import KINDS, rounds
 host, minutes = sys.argv[1], float(sys.argv[2])
 picture = "sensor_msgs/msg/CompressedImage"
 robot = SdkBridge(host, KINDS | {"/camera": picture})
-entries = rounds(14)
+entries = rounds(4 + 2 * minutes)
 jpeg = np.random.default_rng(0).integers(0, 255, 50_000, np.uint8)
 last = entries[0].time
 content = {"header": header(last), "format": "jpeg", "data": jpeg}

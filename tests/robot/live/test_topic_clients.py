@@ -8,7 +8,8 @@ import pytest
 from zenoh import ZBytes
 from zenoh.ext import Int64, z_deserialize
 
-from robot.live.topics_client import Received, open_client
+from robot.live.topics_client import Received
+from robot.live.topics_rig import open_client
 from tactile.base.errors import InputError
 from tests.helpers.ros_bags import tf, transform
 from tests.helpers.stand_in_robot import PlainBridge, SdkBridge, ZenohRobot
@@ -38,16 +39,25 @@ def test_the_client_connects_only_where_it_is_told_and_bounds_what_it_takes(loop
         robot.close()
 
 
-def test_a_connection_with_tls_needs_a_certificate_that_is_trusted(loopback, tmp_path, monkeypatch):
+def bridge_with_tls(host: str, secrets: tuple[Path, Path]) -> PlainBridge:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(*reversed(secrets))
+    return PlainBridge(host, KINDS, ssl=context)
+
+
+def zenoh_with_tls(host: str, secrets: tuple[Path, Path]) -> ZenohRobot:
+    return ZenohRobot(host, KINDS, secrets=secrets)
+
+
+@pytest.mark.parametrize("start", [bridge_with_tls, zenoh_with_tls])
+def test_a_connection_with_tls_needs_a_certificate_that_is_trusted(start, loopback, tmp_path, monkeypatch):
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     made = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=robot"]
-    made += ["-addext", f"subjectAltName=IP:{loopback}", "-keyout", str(key), "-out", str(certificate)]
-    subprocess.run(made, check=True, capture_output=True)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(certificate, key)
-    robot = PlainBridge(loopback, KINDS, ssl=context)
+    made += ["-addext", f"subjectAltName=IP:{loopback}", "-addext", "basicConstraints=critical,CA:FALSE"]
+    subprocess.run([*made, "-keyout", str(key), "-out", str(certificate)], check=True, capture_output=True)
+    robot = start(loopback, (key, certificate))
     try:
-        with pytest.raises(InputError, match="no trusted connection"):
+        with pytest.raises(InputError, match=r"no (trusted )?connection"):
             open_client(robot.address, lambda channel: True)
         monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
         client = open_client(robot.address, lambda channel: True)
