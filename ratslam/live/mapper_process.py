@@ -141,6 +141,10 @@ class Mapper(AbstractContextManager["Mapper"]):
             self._outbox.put(PIECE)
         self._outbox.put(sample)
 
+    def warn(self, sentences: list[str]) -> None:
+        """Passes warnings about the input to the run."""
+        self._outbox.put(sentences)
+
     def behind(self) -> float:
         """Waiting time of the oldest sample that is not mapped yet, s."""
         self.receive()
@@ -211,7 +215,7 @@ class PipeSource(ClosedSource):
 
     Attributes:
         interrupted: whether the session ended early. received: arrival of the last sample, s. count: samples
-            so far. begins: whether no odometry leads to the last sample.
+            so far. begins: whether no odometry leads to the last sample. warnings: about the input.
     """
 
     name, digest, length = "live", "", None
@@ -221,6 +225,7 @@ class PipeSource(ClosedSource):
         self.info = like.info
         self.interrupted = True  # until the parent sends the flag
         self.received, self.count, self.begins = 0.0, 0, False
+        self.warnings = list[str]()
         self._line = line
 
     def __iter__(self) -> Iterator[Sample]:
@@ -233,6 +238,9 @@ class PipeSource(ClosedSource):
             if isinstance(message, bool):
                 self.interrupted = message
                 return
+            if isinstance(message, list):
+                self.warnings += message
+                continue
             if message == PIECE:
                 piece = True
                 continue
@@ -281,7 +289,10 @@ def _map(line: Connection) -> None:
         read = correct_odometry(fed, config.recording.odometry) if config.recording else fed
         source = open_touch_source(read, config.touch)
         watchers = [*observers, _drawer(line)] if job.draws else observers
-        with open_runner(config, source, job.directory, job.resume, session, watchers) as runner:
+        opened = open_runner(
+            config, source, job.directory, job.resume, session, watchers, warnings=fed.warnings
+        )
+        with opened as runner:
             # Sends the output of the process, including tracebacks, to a file: the terminal is the parent's.
             path = job.directory / LOG
             with path.open("ab") as file:

@@ -15,6 +15,7 @@ from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
 from robot.live.map_publisher import MapPublisher, PoseReport
 from robot.live.topics_rig import TopicsRig, require_topics, run_topics_loop
+from robot.recordings.cdr import doubts_of
 from robot.sources.source import SourceDescription, SourceInfo
 from tactile.base.errors import InputError, tell
 
@@ -85,7 +86,10 @@ class TopicsSession(LiveRobot):
             lost = sum(self.rig.steps.dropped.values())
             tell(f"{mapper_status(mapper)}{lost} views dropped, {self.rig.outages} outages")
 
-        run_topics_loop(self.rig, mapper, count)
+        try:
+            run_topics_loop(self.rig, mapper, count)
+        finally:
+            mapper.warn(doubts_of(self.rig.events))
 
     def report(self) -> dict[str, Any]:
         rig, now = self.rig, (time.process_time(), time.monotonic())

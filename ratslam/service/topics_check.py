@@ -150,5 +150,7 @@ def _row(channel: Channel, topic: TopicDescription | None) -> tuple[str, ...]:
         return channel.topic, channel.kind, "", "", "", able
     clock = topic.stamped or topic.received
     age = "" if topic.stamped is None else f"{-1e3 * topic.stamped.ahead:.0f} ms"
+    if topic.stamped is not None and abs(topic.stamped.ahead) > CLOCKS_DIFFER:
+        age = f"{-topic.stamped.ahead:.3g} s"
     words = topic.shape.words if topic.shape else ""
     return channel.topic, channel.kind, f"{clock.rate_hz:.3g}", age, words, ", ".join(topic.roles) or "-"

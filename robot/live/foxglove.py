@@ -170,7 +170,7 @@ def _connect(address: str) -> tuple[Any, ExitStack]:
         from websockets.sync.client import connect
     except ImportError:
         raise InputError("websockets", "not installed", "", "pip install 'ratslam[live-ros]'") from None
-    expected = "the address of a Foxglove bridge, ws://HOST:8765 or wss://HOST:8765"
+    expected = "a Foxglove bridge, ws://HOST:8765 or wss://HOST:8765, or a router, zenoh://HOST:7447"
     stack = ExitStack()
     try:
         opened = connect(
@@ -178,11 +178,11 @@ def _connect(address: str) -> tuple[Any, ExitStack]:
             open_timeout=CONNECT_TIMEOUT, close_timeout=1.0, ping_interval=5.0, ping_timeout=10.0,
         )  # fmt: skip
         socket = stack.enter_context(opened)
-    except InvalidURI:
-        raise InputError(address, "no address of a websocket", expected) from None
     except ssl.SSLError as error:
         cure = "the certificate must be valid for this name, or its issuer's be given in SSL_CERT_FILE"
         raise InputError(address, f"no trusted connection ({error})", expected, cure) from None
+    except (InvalidURI, ValueError):  # ValueError: of a port that cannot be
+        raise InputError(address, "no address of a websocket", expected) from None
     except (OSError, NegotiationError, WebSocketException, TimeoutError) as error:
         words = " ".join(str(error).split()) or type(error).__name__
         raise InputError(address, f"no connection ({words})", expected, START) from None

@@ -76,9 +76,9 @@ class TopicsRig(PolledRig):
 
     Attributes:
         client: the connection. steps: of the session. latencies: from the arrival of the message that
-            completed each sample to the mapper, s. spoilt: messages that could not be used, by topic.
-            outages: number of connections lost. began: times of this process at the beginning, s: computing
-            and on the clock.
+            completed each sample to the mapper, s. events: of the session. spoilt: messages that could not be
+            used, by topic. outages: number of connections lost. began: times of this process at the
+            beginning, s: computing and on the clock.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class TopicsRig(PolledRig):
         known = self.messages.topics
         self._kinds |= {name: known[name].kind for name in self.topics.record if name in known}
         self.steps = self._new_steps()
-        self.latencies = list[float]()
+        self.latencies, self.events = list[float](), list[Event]()
         self.spoilt, self.outages = Counter[str](), 0
         self.began = time.process_time(), time.monotonic()
         self._transforms = list[Received]()  # before the session
@@ -143,6 +143,7 @@ class TopicsRig(PolledRig):
         return TopicSteps(self._recording, self.messages, self.topics.max_wait, self._tell_event)
 
     def _tell_event(self, name: str, text: str) -> None:
+        self.events.append(Event(self.now(), name, text))
         self.record_event(name, text)
         if name != "dropped":
             self.messages.warn(f"{name}: {text}")
@@ -211,6 +212,7 @@ class TopicsRig(PolledRig):
         self.epoch, self._heard = now, dict.fromkeys(self.steps.topics, now)
         self.began = time.process_time(), now
         self.messages.counts.clear()
+        self.events.clear()
         for item in self._transforms:
             self._record(item, self.messages.in_cdr(item))
         self._transforms.clear()

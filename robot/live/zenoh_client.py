@@ -87,7 +87,7 @@ class ZenohClient(TopicsClient):
 
         key = str(token.key_expr)
         publisher = _publisher_of(key)
-        if publisher is None:
+        if publisher is None or str(self._session.info.zid()) in key:  # what is published here
             return
         topic = publisher[0].topic
         with self._lock:
@@ -112,6 +112,7 @@ class ZenohClient(TopicsClient):
 
     def _listen(self, channel: Channel) -> Any:
         """A new subscriber, who hears the last messages too where the publisher keeps them."""
+        import zenoh
         from zenoh.ext import HistoryConfig, declare_advanced_subscriber
 
         def receive(sample: Any) -> None:
@@ -121,9 +122,10 @@ class ZenohClient(TopicsClient):
         key = f"{self._domain}/{channel.topic.strip('/')}/{_written(channel.kind)}/*"
         kept = {durability for each, _, durability in self._publishers.values() if each == channel}
         if TRANSIENT_LOCAL not in kept:
-            return self._session.declare_subscriber(key, receive)
-        history = HistoryConfig(detect_late_publishers=True)
-        return declare_advanced_subscriber(self._session, key, receive, history=history)
+            return self._session.declare_subscriber(key, receive, allowed_origin=zenoh.Locality.REMOTE)
+        history, others = HistoryConfig(detect_late_publishers=True), zenoh.Locality.REMOTE
+        session = self._session
+        return declare_advanced_subscriber(session, key, receive, history=history, allowed_origin=others)
 
     def _announce(self, topic: str, kind: str, number: int) -> tuple[str, Any]:
         """The key of a topic that is published here, and the token that announces it."""

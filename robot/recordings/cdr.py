@@ -14,6 +14,7 @@ differences from frame to frame: small numbers, which compress well.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -139,6 +140,26 @@ class Event(NamedTuple):
     time: float
     name: str
     text: str
+
+
+DOUBTFUL = {
+    "lost": "the connection to the robot was lost",
+    "vanished": "a topic was no longer advertised",
+    "gap": "odometry was missing, and a pose bridges it",
+    PIECE: "the odometry did not go on, and a piece of the map begins",
+    "unusable": "messages could not be used",
+    "garbage": "what came is no message",
+}
+"""Events after which the input of a session is not clean, and what they say."""
+
+
+def doubts_of(events: Iterable[Event]) -> list[str]:
+    """What events say against the input, a sentence for each kind, with how often it came."""
+    found = dict[str, list[str]]()
+    for event in events:
+        found.setdefault(event.name, []).append(event.text)
+    said = ((DOUBTFUL[name], texts) for name, texts in found.items() if name in DOUBTFUL)
+    return [f"live session: {what} ({len(texts)} x, first: {texts[0]})" for what, texts in said]
 
 
 def encode(

@@ -25,7 +25,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from robot.drivers.head.decoder import Frames, FrameWindow, assemble_cycle
 from robot.recordings import cdr
-from robot.recordings.cdr import Event, Malformed
+from robot.recordings.cdr import Event, Malformed, doubts_of
 from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
 from robot.recordings.sanity_checks import clock_errors, first_error, nonfinite_errors, view_errors
 from robot.sources.input_files import digest_of, raise_errors, readable, require_file
@@ -371,8 +371,8 @@ class Recording(ClosedSource):
         self.digest = judge.stretch.digest(self.digest)
         time = self._check_columns(rows[self._first : self._last], judge)
         self.rate_hz = rate_of(time) or description.rate_hz
-        if self.truncated:
-            judge.say(self.warning)
+        for sentence in ([self.warning] if self.truncated else []) + doubts_of(events):
+            judge.say(sentence)
 
     def _check_columns(self, columns: np.ndarray, judge: InputJudge) -> np.ndarray:
         """Times [N] s of the samples with odometry; raises the errors of all columns."""

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from evaluation.artifacts.run_reader import read_manifest
 from ratslam.cli import main
 from tests.helpers.commands import ROOT, refused, said, start
 from tests.helpers.ros_bags import ROS2, Entry, odometry, scan, write_bag
@@ -150,6 +151,13 @@ def maps_alike(folder: Path, again: Path) -> None:
     assert main(["run", str(folder / "config.yaml"), "-o", str(again)]) == 0
     for name in SAME:
         assert (folder / name).read_bytes() == (again / name).read_bytes(), name
+    doubts, repeated = (
+        [said for said in read_manifest(run).warnings if said.startswith("live session")]
+        for run in (folder, again)
+    )
+    assert doubts == repeated
+    if json.loads((folder / "live.json").read_text())["outages"]:
+        assert "the connection to the robot was lost" in " ".join(doubts)
 
 
 def maps_of_file(folder: Path, config: Path, bag: Path, again: Path) -> None:

@@ -25,7 +25,15 @@ def test_the_client_connects_only_where_it_is_told_and_bounds_what_it_takes(loop
         open_client("robot:8765", lambda channel: True)
     with pytest.raises(InputError, match="no connection"):
         open_client(f"zenoh://{loopback}:9", lambda channel: True)
-    for wrong in ("zenoh:robot", "zenoh://robot:x", "zenoh://robot/first", "zenohs://robot"):
+    with pytest.raises(InputError, match="no address of a websocket"):
+        open_client("ws://robot:99999", lambda channel: True)
+    for wrong in (
+        "zenoh:robot",
+        "zenoh://robot:99999",
+        "zenoh://robot:x",
+        "zenoh://robot/first",
+        "zenohs://robot",
+    ):
         with pytest.raises(InputError, match="no address of a Zenoh router"):
             open_client(wrong, lambda channel: True)
     robot = PlainBridge(loopback, KINDS)
@@ -114,12 +122,14 @@ def test_a_robot_on_zenoh_is_heard_in_its_domain_and_what_it_keeps_is_repeated(h
 @pytest.mark.parametrize("humble", [False, True])
 def test_what_is_published_over_zenoh_has_what_ros_expects_beside_it(humble, loopback):
     robot = ZenohRobot(loopback, KINDS, humble=humble)
-    client = open_client(robot.address, lambda channel: False)
+    client = open_client(robot.address, lambda channel: channel.topic == "/ratslam/pose")
     try:
         wait(lambda: set(client.channels) == set(KINDS))
         for content in (b"first", b"second"):
             client.publish("/ratslam/pose", KINDS["/odom"], content)
         wait(lambda: len(robot.published) == 2)
+        assert client.take(0.5) == []  # not what was published here
+        assert set(client.channels) == set(KINDS)
     finally:
         client.close()
         robot.close()
