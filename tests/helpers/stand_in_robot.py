@@ -160,7 +160,6 @@ WRITTEN = {
     "sensor_msgs/msg/LaserScan": "sensor_msgs::msg::dds_::LaserScan_",
     "sensor_msgs/msg/Imu": "sensor_msgs::msg::dds_::Imu_",
     "tf2_msgs/msg/TFMessage": "tf2_msgs::msg::dds_::TFMessage_",
-    "lab_msgs/msg/Custom": "lab_msgs::msg::dds_::Custom_",
 }
 """Types as `rmw_zenoh` writes them."""
 
