@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from robot.drivers.head.driver_config import Address
-from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig
+from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig, FirmwareConfig
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
 from robot.emulators.ur10.emulator_config import UrEmulatorConfig
 from robot.live.arm_route import plan_path
@@ -74,4 +74,7 @@ def create_emulator_config(
         bridge=bridge,
         strain_per_radian=create.strain_per_radian,
     )
-    return CreateEmulatorConfig(wheel_base=create.wheel_base, seed=plan.seed, port=create.port, world=world)
+    firmware = FirmwareConfig(model=create.model, wrap=create.wrap)
+    return CreateEmulatorConfig(
+        firmware=firmware, wheel_base=create.wheel_base, seed=plan.seed, port=create.port, world=world
+    )

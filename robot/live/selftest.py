@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from robot.drivers.create.driver_config import CommandRefused
-from robot.drivers.create.protocol import Bumps
+from robot.drivers.create.protocol import MODELS, Bumps
 from robot.drivers.create.serial_link import open_port
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.safety import check_controller
@@ -106,7 +106,7 @@ def find_devices(rig: Rig | CreateRig) -> Iterator[str]:
         except CommandRefused as error:
             cure = "a lower speed in the plan, or a higher limit"
             raise InputError("live.create.plan.behaviour", str(error), "", cure) from None
-        open_port(rig.create.port).close()
+        open_port(rig.create.port, MODELS[rig.create.model].baud).close()
         yield f"Create: port {rig.create.port} can be opened"
     rig.head.start()
     identity = rig.head.identity

@@ -1,8 +1,9 @@
 """Driver of a Create: a control thread, and a watchdog process for the end of that thread.
 
 The thread reads the sensors, checks them and commands the wheels, in this order. Odometry sums the whole
-millimetres and degrees that the Create reports. The robot keeps the remainder below 1 mm and 1 degree for the
-next reply: unless a reply is lost, sums stay within these bounds of the wheels' motion, at any reading rate.
+millimetres and degrees that a Create 1 reports, or the encoders' counts of a Create 2. A Create 1 that keeps
+the remainder below 1 mm and 1 degree for the next reply has sums within these bounds of the wheels' motion,
+unless a reply is lost; for one that loses it see `robot.drivers.create.wheel_counters`.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from robot.drivers.create.driver_config import CommandRefused, CreateConfig, Sto
 from robot.drivers.create.protocol import Bumps
 from robot.drivers.create.serial_link import BadReply, LinkCounts, NoReply, SerialLink, Unplugged, open_port
 from robot.drivers.create.watchdog import Watchdog
+from robot.drivers.create.wheel_counters import CreateOdometry, CreateReading, WheelCounters
 from tactile.base.errors import InputError
 from tactile.base.types import Odometry
 
@@ -33,15 +35,22 @@ class ControlLoop:
     awake, in safe mode, with cleared counters.
 
     Args:
-        clock: returns the host's monotonic time, s.
+        clock: returns the host's monotonic time, s. tell: called with each reading of the counters, or None.
     """
 
-    def __init__(self, config: CreateConfig, link: SerialLink, clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        config: CreateConfig,
+        link: SerialLink,
+        clock: Callable[[], float],
+        tell: Callable[[CreateReading], None] | None = None,
+    ) -> None:
         self._config, self.link, self._clock = config, link, clock
         self._lock = threading.Lock()
         self._command = (0, 0, -math.inf)  # requested speeds, right and left, mm/s; time of the request, s
-        self._reply_time = clock()
-        self._odometer = CreateOdometry(self._reply_time)
+        self._reply_time = self._counted = clock()  # of any reply, and of one with the counters
+        self.counters, self._tell = WheelCounters(config, self._reply_time), tell
+        self._odometer = CreateOdometry(self._reply_time, (config.distance_scale, config.turn_scale))
         self._outstanding = 0  # at the last call of `gap`
         self._enter_safe, self._pause_end = False, -math.inf
         self.active_stop: StopEvent | None = None
@@ -69,10 +78,10 @@ class ControlLoop:
             return self._odometer.take_odometry()
 
     def gap(self) -> bool:
-        """Whether a reply was lost since the last call, possibly with its motion."""
+        """Whether a reply was lost since the last call, possibly with its motion; encoders lose none."""
         with self._lock:
             before, self._outstanding = self._outstanding, self.link.counts.outstanding
-            return self._outstanding > before
+            return self._outstanding > before and self._config.model == "create1"
 
     def halt(self, reason: StopReason, detail: str) -> None:
         """Stops the robot with the next poll, until release; the first reason is kept."""
@@ -99,15 +108,23 @@ class ControlLoop:
                 self.halt(StopReason.LEFT_SAFE_MODE, f"the robot is in {found.mode.name.lower()} mode")
             elif found.bumps & Bumps.BUMPED and right + left > 0:  # driving back is allowed
                 self.halt(StopReason.BUMPED, (found.bumps & Bumps.BUMPED).describe())
-            fresh = self._clock() - requested <= self._config.patience
-            drives = fresh and self.active_stop is None
-            self.link.send(protocol.drive(right, left) if drives else protocol.STOP)
+            if not self._drives(requested):
+                right = left = 0
+            self.link.send(protocol.drive(right, left))
+            self.counters.command(right, left, self._clock())
         except Unplugged as error:
             self.halt(StopReason.UNPLUGGED, str(error))
 
+    def _drives(self, requested: float) -> bool:
+        """Whether a command of this time, s, holds now."""
+        return self._clock() - requested <= self._config.patience and self.active_stop is None
+
     def _read(self) -> protocol.SensorReply | None:
+        asked, (right, left, requested) = self._clock(), self._command
+        query = self.counters.query(*((right, left) if self._drives(requested) else (0, 0)), asked)
+        expected = self.counters.expected
         try:
-            found = self.link.ask(self._clock() - self._reply_time)
+            found = self.link.ask(asked - self._counted, query)
         except (NoReply, BadReply) as error:
             since = self._clock() - self._reply_time
             if since >= self._config.silence:
@@ -116,36 +133,12 @@ class ControlLoop:
             return None
         with self._lock:
             self._reply_time, self.last_reply = self._clock(), found
-            self._odometer.add(found.millimetres, found.degrees, self._reply_time)
+            if query != protocol.STATE_QUERY or found.millimetres or found.degrees:  # else none was asked for
+                self._counted = self._reply_time
+                if self._tell is not None:
+                    self._tell(CreateReading(asked, self._reply_time, expected, found))
+                self._odometer.add(*self.counters.read(found), self._reply_time)
         return found
-
-
-class CreateOdometry:
-    """Accumulates readings until they are taken.
-
-    Args:
-        time: host time of the reading that cleared the robot's counters, s.
-    """
-
-    def __init__(self, time: float) -> None:
-        self._taken = self._time = time
-        self._x = self._y = 0.0
-        self._degrees = 0  # an integer, so that the sum is exact
-
-    def add(self, millimetres: int, degrees: int, time: float) -> None:
-        """Adds a reading (mm, degrees, host time s): an arc since the previous one."""
-        turned, turn = math.radians(self._degrees), math.radians(degrees)
-        chord = millimetres / 1000 * (math.sin(turn / 2) / (turn / 2) if turn else 1.0)
-        self._x += chord * math.cos(turned + turn / 2)
-        self._y += chord * math.sin(turned + turn / 2)
-        self._degrees += degrees
-        self._time = time
-
-    def take_odometry(self) -> Odometry:
-        """Motion since the last call; dt ends at the last reading. The turn is not wrapped."""
-        motion = Odometry(self._x, self._y, math.radians(self._degrees), self._time - self._taken)
-        self._taken, self._x, self._y, self._degrees = self._time, 0.0, 0.0, 0
-        return motion
 
 
 TRIES = 5
@@ -165,10 +158,13 @@ class CreateDriver:
 
     Times are those of `time.monotonic()`. Any thread may call the methods. They return at once; only
     `start`, `stop` and `close` take up to some tenths of a second.
+
+    Args:
+        tell: called with each reading of the counters, on the driver's thread.
     """
 
-    def __init__(self, config: CreateConfig) -> None:
-        self.config = config
+    def __init__(self, config: CreateConfig, tell: Callable[[CreateReading], None] | None = None) -> None:
+        self.config, self._tell = config, tell
         self._loop: ControlLoop | None = None
         self._link: SerialLink | None = None
         self.watchdog: Watchdog | None = None
@@ -183,11 +179,12 @@ class CreateDriver:
         """
         if self._link is not None:
             raise ValueError("a driver starts once")
-        self._link = SerialLink(open_port(self.config.port))
+        config, model = self.config, protocol.MODELS[self.config.model]
+        self._link = SerialLink(open_port(config.port, model.baud), model)
         try:
-            self.watchdog = Watchdog(self.config.port, self.config.patience, self.config.replug)
+            self.watchdog = Watchdog(config.port, model.baud, config.patience, config.replug)
             self._wake_up(self._link)
-            self._loop = ControlLoop(self.config, self._link, time.monotonic)
+            self._loop = ControlLoop(config, self._link, time.monotonic, self._tell)
         except BaseException:
             self.close()
             raise
@@ -211,7 +208,7 @@ class CreateDriver:
 
     def refresh(self) -> None:
         """Reads the sensors now; returns when the reading has arrived or failed. Commands continue."""
-        self._running_loop()
+        self._running_loop().counters.due = True
         self._next_poll()
 
     def release(self) -> None:
@@ -240,6 +237,11 @@ class CreateDriver:
     def last_reply(self) -> protocol.SensorReply | None:
         """The last reading."""
         return self._loop.last_reply if self._loop else None
+
+    @property
+    def doubt(self) -> str:
+        """What speaks against the odometry so far; '' for nothing."""
+        return self._loop.counters.doubt if self._loop else ""
 
     @property
     def counts(self) -> LinkCounts:
@@ -303,8 +305,8 @@ class CreateDriver:
         except Unplugged as error:
             last = str(error)
         if found is None:
-            expected = f"replies of a Create at {protocol.BAUD} baud"
-            cure = "switch it on, check cable and port; a Create 2 is not supported"
+            expected = f"replies of a {self.config.model} at {protocol.MODELS[self.config.model].baud} baud"
+            cure = "switch it on, check cable, port and `live.create.model` (create1 or create2)"
             raise NoAnswer(port, f"no valid reply ({last})", expected, cure)
         if found.bumps & Bumps.DROPPED or found.mode != protocol.Mode.SAFE:
             stays = f"the Create stays in {found.mode.name.lower()} mode, {found.bumps.describe()}"

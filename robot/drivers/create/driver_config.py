@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from enum import Enum
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from robot.drivers.create.protocol import TOP_SPEED, WHEEL_BASE
+from robot.drivers.create.protocol import MODELS, TOP_SPEED, WHEEL_BASE, WRAP
 from tactile.base.settings import Settings
 
 
@@ -19,12 +19,23 @@ class CommandRefused(ValueError):
 class CreateConfig(Settings):
     """A Create on a serial port."""
 
+    model: Literal["create1", "create2"] = "create1"
+    """The first Create (2007), or the Create 2 and Roombas from the 500s on, whose encoders are read."""
     port: str = "/dev/ttyUSB0"
     """Serial port; on Windows `COM3` or the like."""
     speed: Annotated[float, Field(gt=0, le=TOP_SPEED / 1000)] = 0.2
     """Speed limit of each wheel, m/s."""
     wheel_base: PositiveFloat = WHEEL_BASE
-    """Distance between the wheels, m."""
+    """Distance between the wheels, m; of a Create 2 0.235."""
+    distance_scale: PositiveFloat = 1.0
+    """True distance for 1 m that the robot reports; `check robot create` measures it."""
+    turn_scale: PositiveFloat = 1.0
+    """True turn for 1 rad that the robot reports; likewise."""
+    remainders: Literal["unknown", "kept", "lost"] = "unknown"
+    """What a Create 1 does with the rest below 1 mm and 1 degree at each reading; likewise. Of a robot that
+    loses it, a motion is read once it is long or ends; bumper and mode are read at each poll."""
+    wrap: Annotated[int, Field(ge=2**12, le=2**16)] = WRAP
+    """Counts after which the encoders of a Create 2 start again; likewise."""
     rate: Annotated[float, Field(ge=5, le=50)] = 20.0
     """Rate of sensor readings, Hz; the motion between two readings is taken as an arc."""
     patience: Annotated[float, Field(ge=0.1, le=5)] = 0.5
@@ -34,6 +45,13 @@ class CreateConfig(Settings):
 
     replug: PositiveFloat = 60.0
     """Time for which the watchdog process waits for a disconnected port, to stop the robot then, s."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _base_of_model(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("model") in MODELS:
+            return {"wheel_base": MODELS[data["model"]].wheel_base, **data}
+        return data
 
     @model_validator(mode="after")
     def _replies_fit(self) -> CreateConfig:

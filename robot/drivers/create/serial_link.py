@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from robot.drivers.create import protocol
-from robot.drivers.create.protocol import SensorReply
+from robot.drivers.create.protocol import CreateModel, SensorReply
 from tactile.base.errors import InputError
 
 ANSWER = 0.1
@@ -57,8 +57,8 @@ class LinkCounts(NamedTuple):
         return self.lost - self.late
 
 
-def open_port(name: str, *, exclusive: bool = True) -> Any:
-    """Opens the serial port, a `serial.Serial`, at the Create's speed.
+def open_port(name: str, baud: int, *, exclusive: bool = True) -> Any:
+    """Opens the serial port, a `serial.Serial`, at the robot's speed, baud.
 
     Raises:
         NoPort: the port cannot be opened; `PortBusy` if another program holds it.
@@ -71,7 +71,7 @@ def open_port(name: str, *, exclusive: bool = True) -> Any:
     # Without `exclusive` pyserial takes no lock; False is refused on Windows.
     more = {"exclusive": True} if exclusive else {}
     try:
-        return serial.Serial(name, protocol.BAUD, timeout=ANSWER, write_timeout=ANSWER, **more)
+        return serial.Serial(name, baud, timeout=ANSWER, write_timeout=ANSWER, **more)
     except OSError as error:
         # The text of pyserial's error is the only place of most causes.
         cause = error.errno or getattr(error.__context__, "errno", None)
@@ -88,14 +88,14 @@ def open_port(name: str, *, exclusive: bool = True) -> Any:
         raise NoPort(name, f"cannot be opened ({error})", "a serial port") from None
 
 
-def _replies(data: bytes, elapsed: float, most: int) -> list[SensorReply]:
+def _replies(model: CreateModel, data: bytes, elapsed: float, most: int) -> list[SensorReply]:
     """The bytes as replies, oldest first, at most the last `most`; if invalid, their end as one, or none."""
-    size = protocol.REPLY.size
-    pieces = [SensorReply.parse(data[i : i + size], elapsed) for i in range(0, len(data), size)]
+    size = model.reply.size
+    pieces = [model.parse(data[i : i + size], elapsed) for i in range(0, len(data), size)]
     believed = [piece for piece in pieces if piece is not None]
     if len(believed) == len(pieces):
         return believed[-most:]
-    last = SensorReply.parse(data[-size:], elapsed)
+    last = model.parse(data[-size:], elapsed)
     return [] if last is None else [last]
 
 
@@ -106,8 +106,8 @@ class SerialLink:
     the next; of a disturbed reply the end is parsed, since noise mostly precedes it.
     """
 
-    def __init__(self, port: Any) -> None:
-        self._port = port
+    def __init__(self, port: Any, model: CreateModel = protocol.MODELS["create1"]) -> None:
+        self._port, self._model = port, model
         self._late_motion = (0, 0)
         self.counts = LinkCounts()
 
@@ -116,33 +116,35 @@ class SerialLink:
         with self._attached():
             self._port.write(command)
 
-    def ask(self, elapsed: float) -> SensorReply:
+    def ask(self, elapsed: float, query: bytes | None = None) -> SensorReply:
         """Sends a query and returns the reply.
 
         Args:
-            elapsed: s since the last reply; inf without one.
+            elapsed: s since the last reply; inf without one. query: one with a reply of the same layout,
+                instead of the model's.
 
         Raises:
             NoReply, BadReply, Unplugged: no valid reply.
         """
+        model = self._model
         with self._attached():
             # Late replies are accepted. Any other bytes make the reply before them doubtful.
             late = self._port.read(self._port.in_waiting) if self._port.in_waiting else b""
             outstanding = self.counts.outstanding
-            found = _replies(late, elapsed, outstanding) if outstanding else []
-            self._accept(found, late=len(found), stray=len(late) - protocol.REPLY.size * len(found))
+            found = _replies(model, late, elapsed, outstanding) if outstanding else []
+            self._accept(found, late=len(found), stray=len(late) - model.reply.size * len(found))
             self._count(lost=int(bool(late) and not found))
             self._port.timeout = ANSWER
-            self._port.write(protocol.QUERY)
-            data = self._port.read(protocol.REPLY.size)
+            self._port.write(query or model.query)
+            data = self._port.read(model.reply.size)
             # Noise and the start of a reply can look like a reply: then more bytes follow.
-            if data and (self._port.in_waiting or SensorReply.parse(data, elapsed) is None):
+            if data and (self._port.in_waiting or model.parse(data, elapsed) is None):
                 data += self._rest()
-        found = _replies(data, elapsed, 1 + self.counts.outstanding)
+        found = _replies(model, data, elapsed, 1 + self.counts.outstanding)
         if not found:
             self._count(lost=1, stray=len(data))
             raise BadReply(f"{len(data)} bytes: {data[:8].hex(' ')}") if data else NoReply("no reply")
-        self._accept(found, late=len(found) - 1, stray=len(data) - protocol.REPLY.size * len(found))
+        self._accept(found, late=len(found) - 1, stray=len(data) - model.reply.size * len(found))
         (millimetres, degrees), self._late_motion = self._late_motion, (0, 0)
         return found[-1]._replace(millimetres=millimetres, degrees=degrees)
 
@@ -160,7 +162,7 @@ class SerialLink:
         """All bytes until the line is quiet, at most those of one time-out."""
         self._port.timeout = QUIET
         data = b""
-        while len(data) < protocol.BAUD // 10 * ANSWER and (
+        while len(data) < self._model.baud // 10 * ANSWER and (
             more := self._port.read(max(1, self._port.in_waiting))
         ):
             data += more

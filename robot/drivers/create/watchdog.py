@@ -1,8 +1,8 @@
 """Watchdog process: stops the wheels when the driver's process has ended or hangs. The Create has none.
 
-The driver starts `python -m robot.drivers.create.watchdog PORT PATIENCE REPLUG` and sends a heartbeat, any
-byte, to its standard input, which it echoes. After PATIENCE s without one, or at the end of input, it stops
-the wheels. If the port is gone then, it waits REPLUG s for its return and stops them then. `q` ends it.
+The driver starts `python -m robot.drivers.create.watchdog PORT BAUD PATIENCE REPLUG` and sends a heartbeat,
+any byte, to its standard input, which it echoes. After PATIENCE s without one, or at the end of input, it
+stops the wheels. If the port is gone then, it waits REPLUG s for its return and stops them then. `q` ends it.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ class Watchdog:
     """Starts the watchdog process and sends its heartbeat.
 
     Args:
-        patience: time without a heartbeat, or without its echo, that counts as a hang, s. replug: time for
-            which the process waits for a port that was disconnected, s.
+        baud: speed of the port. patience: time without a heartbeat, or without its echo, that counts as a
+            hang, s. replug: time for which the process waits for a port that was disconnected, s.
     """
 
-    def __init__(self, port: str, patience: float, replug: float) -> None:
-        command = [sys.executable, "-m", "robot.drivers.create.watchdog", port, repr(patience), repr(replug)]
+    def __init__(self, port: str, baud: int, patience: float, replug: float) -> None:
+        words = port, str(baud), repr(patience), repr(replug)
+        command = [sys.executable, "-m", "robot.drivers.create.watchdog", *words]
         with withheld_signals():  # they must not end it before the session
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0, start_new_session=True
@@ -106,9 +107,9 @@ class Watchdog:
             self._ready.set()
 
 
-def _watch(port: str, patience: float, replug: float) -> None:
+def _watch(port: str, baud: int, patience: float, replug: float) -> None:
     """Runs the watchdog: stops the wheels once per time-out of the heartbeat (`patience`, s)."""
-    line = open_port(port, exclusive=False)
+    line = open_port(port, baud, exclusive=False)
     beats: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def read_beats() -> None:
@@ -134,13 +135,13 @@ def _watch(port: str, patience: float, replug: float) -> None:
             line.write(protocol.STOP_ANYHOW)
         except OSError:
             line.close()  # else the system may give the returning port another name
-            _stop_on_return(port, replug)
+            _stop_on_return(port, baud, replug)
             return
         if data is not None:
             return
 
 
-def _stop_on_return(port: str, replug: float) -> None:
+def _stop_on_return(port: str, baud: int, replug: float) -> None:
     """Waits for a disconnected port and stops the robot on it, which then leaves safe mode.
 
     Ends without a command if another program has the port: a new session stops the robot itself.
@@ -149,7 +150,7 @@ def _stop_on_return(port: str, replug: float) -> None:
     while time.monotonic() < end:
         try:
             if os.name == "nt" or os.path.exists(port):
-                line = open_port(port)
+                line = open_port(port, baud)
                 for _ in range(2):  # the first bytes after the connection may be lost
                     line.write(protocol.STOP_ANYHOW)
                     time.sleep(RETRY)
@@ -171,4 +172,4 @@ def _say(word: bytes) -> None:
 
 if __name__ == "__main__":
     become_urgent()
-    _watch(sys.argv[1], float(sys.argv[2]), float(sys.argv[3]))
+    _watch(sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), float(sys.argv[4]))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from pydantic import PositiveFloat
+from typing import Literal
 
-from robot.drivers.create.protocol import WHEEL_BASE
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from robot.drivers.create.protocol import WHEEL_BASE, WRAP
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig
 from robot.simulation.create.strain_sensors import WhiskersConfig
 from robot.simulation.create.wheel_odometry import WheelsConfig
@@ -29,8 +31,30 @@ class CreateWorldConfig(Settings):
     """Strain at the base of a whisker for each radian that its sensor reports."""
 
 
+class FirmwareConfig(Settings):
+    """What an emulated Create reports, and how; Creates of several versions misreport their motion."""
+
+    model: Literal["create1", "create2"] = "create1"
+    """The robot: speed of its port, counters or encoders."""
+    distance_scale: PositiveFloat = 1.0
+    """Reported distance for 1 m."""
+    turn_scale: PositiveFloat = 1.0
+    """Reported turn for 1 rad."""
+    remainders: Literal["kept", "lost"] = "kept"
+    """What becomes of the rest below 1 mm and 1 degree at a reading."""
+    counts: NonNegativeInt = 0
+    """Counts of both encoders at the start."""
+    wrap: PositiveInt = WRAP
+    """Counts after which an encoder starts again."""
+    latency: NonNegativeFloat = 0.0
+    """Time until a reply, s."""
+
+
 class CreateEmulatorConfig(Settings):
     """Settings of an emulated Create."""
+
+    firmware: FirmwareConfig = FirmwareConfig()
+    """What it reports."""
 
     wheel_base: float = WHEEL_BASE
     """Distance between the wheels, m."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.drivers.create.protocol import TOP_SPEED, Bumps, Mode
+from robot.drivers.create.protocol import COUNT, MOST_LIGHT, TOP_SPEED, Bumps, Mode
 from robot.emulators.create.emulator_config import CreateEmulatorConfig
 from robot.simulation.create.wheel_odometry import simulate_wheel_odometry
 from robot.world.arena import Arena, wall_segments
@@ -15,6 +15,10 @@ from robot.world.walls import segment_distance
 from tactile.base.random_streams import stream
 
 DATA = {128: 0, 131: 0, 132: 0, 145: 4}  # bytes after an opcode; a query's first byte gives its length
+LIGHTS = tuple(math.radians(angle) for angle in (65, 38, 13, -13, -38, -65))
+"""Directions of the light bumpers, from the left to the right."""
+LIGHT_REACH = 0.03
+"""Distance of a wall over which the signal of a light bumper falls to a third, m."""
 PIECE = 0.01
 """Longest arc between two checks for walls, s."""
 MOVES = 4096
@@ -68,7 +72,7 @@ class EmulatedCreate:
             self._scales = self._scales[:, [0, 2]]
         self._moves = 0
         self._measured = [0.0, 0.0]  # mm and degrees by the wheels' encoders
-        self._reported = [0, 0]  # sums of all replies: mm and degrees
+        self._reported = [0.0, 0.0]  # sums of all replies, and of lost remainders: mm and degrees
         self._begun = b""  # an incomplete command
 
     @property
@@ -97,8 +101,9 @@ class EmulatedCreate:
         right, left = self.right / 1000, self.left / 1000
         way, turn = (right + left) / 2 * seconds, (right - left) / self.config.wheel_base * seconds
         scale = self._scales[self._moves % len(self._scales)]
-        self._measured[0] += 1000 * way * scale[0]
-        self._measured[1] += math.degrees(turn * scale[1])
+        firmware = self.config.firmware
+        self._measured[0] += 1000 * way * scale[0] * firmware.distance_scale
+        self._measured[1] += math.degrees(turn * scale[1]) * firmware.turn_scale
         after = self.base.advance(way, turn)
         if len(self.walls) and self.config.world is not None:
             points = np.array([self.base[:2], after[:2]])
@@ -154,19 +159,37 @@ class EmulatedCreate:
                 self._set_wheels(*(max(-TOP_SPEED, min(TOP_SPEED, v)) for v in (right, left)))
         elif opcode == 149:
             self.queries += 1
-            reply = b""
-            for number in data[1:]:
-                if number in (19, 20):  # the remainder below one unit is added to the next reply
-                    whole = math.trunc(self._measured[number - 19] - self._reported[number - 19])
-                    whole = max(-(2**15), min(2**15 - 1, whole))
-                    self._reported[number - 19] += whole
-                    reply += whole.to_bytes(2, "big", signed=True)
-                else:
-                    reply += bytes([{7: int(self.bumps), 35: int(self.mode)}.get(number, 0)])
-            return reply
+            return b"".join(map(self._packet, data[1:]))
         else:
             self.unknown += 1
         return b""
+
+    def _packet(self, number: int) -> bytes:
+        """The data of a sensor packet."""
+        if number in (19, 20):
+            place, lost = number - 19, self.config.firmware.remainders == "lost"
+            whole = math.trunc(self._measured[place] - self._reported[place])
+            whole = max(-(2**15), min(2**15 - 1, whole))
+            self._reported[place] = self._measured[place] if lost else self._reported[place] + whole
+            return whole.to_bytes(2, "big", signed=True)
+        if number in (43, 44):
+            side = 500 * self.config.wheel_base * math.radians(self._measured[1])
+            way = self._measured[0] + (side if number == 44 else -side)
+            firmware = self.config.firmware
+            return ((firmware.counts + math.floor(way / COUNT)) % firmware.wrap).to_bytes(2, "big")
+        if 46 <= number <= 51:
+            return self._light(LIGHTS[number - 46]).to_bytes(2, "big")
+        return bytes([{7: int(self.bumps), 35: int(self.mode)}.get(number, 0)])
+
+    def _light(self, angle: float) -> int:
+        """The signal of a light bumper at this angle, rad: it falls with the distance of the walls there."""
+        if not len(self.walls):
+            return 0
+        assert self.config.world is not None
+        direction = self.base.heading + angle
+        edge = self.config.world.body * np.array([math.cos(direction), math.sin(direction)])
+        room = float(segment_distance(self.walls, self.pose[None, :2] + edge).min())
+        return round(MOST_LIGHT * math.exp(-room / LIGHT_REACH))
 
     def _set_wheels(self, right: int, left: int) -> None:
         if (right, left) != (self.right, self.left):

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.drivers.create.protocol import BAUD, Bumps
+from robot.drivers.create.protocol import MODELS, Bumps
 from robot.drivers.processes import urgent
 from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig
 from robot.emulators.create.robot import EmulatedCreate
@@ -104,9 +104,9 @@ class Terminal:
                 new.replace(self._link)
             self.path = str(self._link)
 
-    def has_create_baud_rate(self) -> bool:
-        """Whether the client has set the Create's baud rate."""
-        return bool(self._termios.tcgetattr(self._slave)[5] == getattr(self._termios, f"B{BAUD}"))
+    def has_baud_rate(self, baud: int) -> bool:
+        """Whether the client has set this baud rate."""
+        return bool(self._termios.tcgetattr(self._slave)[5] == getattr(self._termios, f"B{baud}"))
 
     def unplug(self) -> None:
         """Closes the terminal, as an unplugged cable would."""
@@ -199,12 +199,14 @@ class _CreateServer:
             data = os.read(self.terminal.master, 4096)
         except OSError:  # no data after all
             return
+        firmware = self.robot.config.firmware
         for whole in self.robot.receive(data):
-            good = self.terminal.has_create_baud_rate()
+            good = self.terminal.has_baud_rate(MODELS[firmware.model].baud)
             reply = self.faults.disturb(whole if good else self.faults.noise(whole))
             step = self.faults.trickle
-            for piece in [reply[i : i + 1] for i in range(len(reply))] if step else [reply]:
-                self._send(piece, step)
+            pieces = [reply[i : i + 1] for i in range(len(reply))] if step else [reply]
+            for number, piece in enumerate(pieces):
+                self._send(piece, step + (0.0 if number else firmware.latency))
 
     def _send(self, piece: bytes, after: float) -> None:
         """Sends bytes some time, s, after all bytes before them."""

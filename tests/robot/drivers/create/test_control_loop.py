@@ -9,60 +9,17 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from robot.drivers.create import protocol
-from robot.drivers.create.driver import PAUSE, ControlLoop, CreateOdometry
 from robot.drivers.create.driver_config import CommandRefused, CreateConfig, StopReason
-from robot.drivers.create.serial_link import SerialLink
+from robot.drivers.create.wheel_counters import CreateOdometry
 from robot.emulators.create import CreateEmulatorConfig, EmulatedCreate
+from robot.emulators.create.emulator_config import CreateWorldConfig, FirmwareConfig
+from robot.world.arena import Arena
 from tactile.base.se2 import compose
+from tests.helpers.create_line import Line, SimulatedDriver
 
 PERIOD = 0.05
+CREATE_1 = protocol.MODELS["create1"]
 NUMBER = st.one_of(st.floats(-0.3, 0.3), st.floats())
-
-
-class Line:
-    """A serial port in memory: commands reach the robot at once, `mangle` changes its replies; a read that
-    times out advances its clock `now`, s."""
-
-    def __init__(self):
-        self.robot = EmulatedCreate(CreateEmulatorConfig())
-        self.now, self.timeout, self.gone, self.waiting = 100.0, 0.0, False, b""
-        self.mangle = lambda reply: reply
-
-    def wait(self, seconds):
-        self.now += seconds
-        self.robot.advance(seconds)
-
-    @property
-    def in_waiting(self):
-        self._attached()
-        return len(self.waiting)
-
-    def read(self, size=1):
-        self._attached()
-        data, self.waiting = self.waiting[:size], self.waiting[size:]
-        if len(data) < size:
-            self.wait(self.timeout or 0.0)
-        return data
-
-    def write(self, data):
-        self._attached()
-        for reply in self.robot.receive(data):
-            self.waiting += self.mangle(reply)
-        return len(data)
-
-    def close(self): ...
-
-    def _attached(self):
-        if self.gone:
-            raise OSError(5, "Input/output error")
-
-    def control_loop(self, **settings):
-        link = SerialLink(self)
-        for command in (protocol.START, protocol.SAFE):
-            link.send(command)
-            self.wait(PAUSE)
-        link.ask(float("inf"))
-        return ControlLoop(CreateConfig(**settings), link, lambda: self.now)
 
 
 def rolls(robot):
@@ -325,7 +282,7 @@ def test_valid_replies_are_accepted(right, left, elapsed, bumps):
     robot.touch(protocol.Bumps(bumps))
     robot.advance(elapsed)
     (reply,) = robot.receive(protocol.QUERY)
-    found = protocol.SensorReply.parse(reply, elapsed)
+    found = CREATE_1.parse(reply, elapsed)
     assert found.bumps == bumps
     assert found.mode == (protocol.Mode.PASSIVE if bumps > 3 else protocol.Mode.SAFE)
     assert abs(found.millimetres - 1000 * robot.base.travelled) < 1
@@ -340,9 +297,9 @@ def test_valid_replies_are_accepted(right, left, elapsed, bumps):
 @example(protocol.REPLY.pack(0, 0, 0, 0), 0.0)
 @example(protocol.REPLY.pack(0, 0, 0, 4), 0.0)
 def test_accepted_replies_are_possible(data, elapsed):
-    found = protocol.SensorReply.parse(data, elapsed)
+    found = CREATE_1.parse(data, elapsed)
     if found is not None:
-        assert protocol.REPLY.pack(*found) == data
+        assert protocol.REPLY.pack(*found[:4]) == data
         assert found.mode in (1, 2, 3)
         assert abs(found.millimetres) <= 500 * (elapsed + 0.1) + 5
         assert abs(found.degrees) <= 222 * (elapsed + 0.1) + 5
@@ -420,3 +377,88 @@ def test_odometry_read_in_parts_is_the_same(legs, taken):
     assert pose[:2] == pytest.approx(total[:2], abs=1e-9)
     assert math.cos(pose[2] - total.dtheta) == pytest.approx(1)
     assert time == pytest.approx(total.dt)
+
+
+def emulated(**firmware):
+    """A robot whose firmware has these settings, on a line of its own."""
+    firmware = FirmwareConfig(**firmware)
+    base = protocol.MODELS[firmware.model].wheel_base
+    return Line(CreateEmulatorConfig(firmware=firmware, wheel_base=base))
+
+
+def turned_and_driven(line, **settings):
+    """Errors of the odometry, degrees and m, of a full turn at 5 degrees/s and of 2 m at 0.1 m/s."""
+    driver = SimulatedDriver(line, CreateConfig(**settings))
+    errors = []
+    for forward, turn, seconds in ((0.0, math.radians(5), 72.0), (0.1, 0.0, 20.0)):
+        before = line.robot.base
+        for _ in range(round(seconds / 0.4)):
+            driver.drive(forward, turn)
+            driver.sleep(0.4)
+        driver.stop()
+        driver.sleep(0.2)
+        motion = driver.loop.take_odometry()
+        errors += [motion.dtheta - line.robot.base.turned + before.turned] if turn else []
+        errors += [motion.dx - line.robot.base.travelled + before.travelled] if forward else []
+    assert driver.active_stop is None
+    return abs(math.degrees(errors[0])), abs(errors[1]), driver
+
+
+@pytest.mark.parametrize(("counts", "wrap"), [(0, 2**16), (65500, 2**16), (100, 2**15)])
+def test_the_encoders_of_a_create_2_are_followed_past_their_end(counts, wrap):
+    line = emulated(model="create2", counts=counts, wrap=wrap)
+    turn, way, _ = turned_and_driven(line, model="create2", wrap=wrap)
+    assert turn < 0.3
+    assert way < 1e-3
+    assert line.robot.unknown == 0
+
+
+def test_a_lost_reply_of_encoders_loses_no_motion():
+    line = emulated(model="create2")
+    loop = line.control_loop(model="create2")
+    drive(line, loop, 0.5, 0.2)
+    line.mangle = lambda reply: b""
+    drive(line, loop, 0.1, 0.2)
+    line.mangle = lambda reply: reply
+    drive(line, loop, 0.4, 0.2)
+    loop.poll()
+    assert not loop.gap()
+    assert loop.take_odometry().dx == pytest.approx(line.robot.base.travelled, abs=1e-3)
+
+
+def test_what_is_lost_at_each_reading_is_seldom_lost_once_this_is_known():
+    turn, way, driver = turned_and_driven(emulated(remainders="lost"))
+    assert turn > 350
+    assert "check robot create" in driver.loop.counters.doubt
+    known = turned_and_driven(emulated(remainders="lost"), remainders="lost")
+    assert known[0] < 1
+    assert known[1] < 5e-3
+    assert known[2].loop.counters.doubt == ""
+    scaled = emulated(remainders="lost", distance_scale=0.9, turn_scale=1.2)
+    turn, way, _ = turned_and_driven(scaled, remainders="lost", distance_scale=1 / 0.9, turn_scale=1 / 1.2)
+    assert turn < 1
+    assert way < 5e-3
+
+
+def test_a_bump_stops_a_robot_whose_counters_are_not_read(line):
+    loop = line.control_loop(remainders="lost")
+    drive(line, loop, 1.0, 0.1)
+    before = loop.take_odometry()
+    assert before.dx < 0.02, "the counters wait for the end of the motion"
+    line.robot.touch(protocol.Bumps.LEFT)
+    drive(line, loop, 0.2, 0.1)
+    assert loop.active_stop.reason is StopReason.BUMPED
+    assert not rolls(line.robot)
+    assert before.dx + loop.take_odometry().dx == pytest.approx(line.robot.base.travelled, abs=1e-3)
+
+
+def test_the_light_bumpers_of_a_create_2_see_the_walls_on_their_side():
+    config = CreateEmulatorConfig(firmware=FirmwareConfig(model="create2"), world=CreateWorldConfig())
+    room = Arena("room", 2.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), (), np.array([1.0, 1.8, 0.0]))
+    line = Line(config, room)
+    loop = line.control_loop(model="create2")
+    loop.poll()
+    light = loop.last_reply.light
+    assert len(light) == 6
+    assert light[0] > light[1] > light[2] > light[5]
+    assert light[0] > 800 > 100 > light[5]

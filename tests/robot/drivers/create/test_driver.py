@@ -183,9 +183,9 @@ import os, signal, time
 from robot.drivers.create import protocol
 from robot.drivers.create.serial_link import SerialLink
 send, ask = SerialLink.send, SerialLink.ask
-def ask_slowly(link, elapsed):
+def ask_slowly(link, *words):
     time.sleep(0.3)  # so that the first poll commands the first motion
-    return ask(link, elapsed)
+    return ask(link, *words)
 SerialLink.ask = ask_slowly
 def send_and_hang(link, command):
     send(link, command)
