@@ -1,5 +1,5 @@
-"""The commands check (conformance of registered parts), export, and tools, of what is seldom needed: recover,
-convert, schema, version, completion."""
+"""The commands check (conformance of registered parts, robots), export, and tools, of what is seldom needed:
+recover, convert, schema, version, completion."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import json
 import os
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, positive_integer, prepare_jax
+from ratslam.cli.common import Commands, add_set, positive_integer, prepare_jax
 from ratslam.runs.settings import SCHEMA_START
 from tactile.base.errors import tell
 from tactile.base.files import make_new_file, require_new_file, write_text_atomically
@@ -120,8 +121,9 @@ FAILED = 1
 def add_check(commands: Commands) -> None:
     """Registers `check` with a command for each kind of part."""
     check = commands.add(
-        "check", None, "check a backend, source, touch front end or metric", "check backend recall", "files"
-    )
+        "check", None, "check a backend, source, touch front end, metric, robot", "check backend recall",
+        "files",
+    )  # fmt: skip
     kinds = Commands(check)
     for kind, what, example in (
         ("backend", "a SLAM method", "recall"),
@@ -135,6 +137,20 @@ def add_check(commands: Commands) -> None:
             "--set", action="append", default=[], metavar="settings.a=value",
             help="replace a setting of it; may be repeated",
         )  # fmt: skip
+    robot = kinds.add(
+        "robot", _check_robot, "drive a robot and measure its odometry", "check robot create live_create"
+    )
+    robot.add_argument("robot", choices=("create",), help="create: a Create 1 or 2, on 2 m of free floor")
+    robot.add_path(
+        "config", "CONFIG",
+        "configuration of a live session, or the bench.json of an earlier check, to judge it with marks",
+    )  # fmt: skip
+    robot.add_path("-o", "DIR", "write page.txt, rig.yaml and bench.json to a new folder")
+    robot.add_argument(
+        "--turned-deg", type=_rate, metavar="DEG", help="how far the first turn really was, degrees"
+    )
+    robot.add_argument("--drove-m", type=_rate, metavar="M", help="how far the first drive really was, m")
+    add_set(robot)
     source, touch = kinds.parsers["source"], kinds.parsers["touch"]
     source.add_argument(
         "--touch", metavar="NAME",
@@ -180,6 +196,27 @@ def _check(kind: str, arguments: argparse.Namespace) -> int:
     rest = f", {skipped} not run" if skipped else ""
     print(f"{name}: {len(statuses)} checks, {failed} failed{rest}")
     return FAILED if failed else 0
+
+
+def _check_robot(arguments: argparse.Namespace) -> int:
+    """Drives a robot, or judges the record of an earlier check, and says what was found."""
+    from ratslam.service.robot_check import ROBOTS, RobotRequest
+
+    def ask(question: str) -> float | None:
+        with suppress(EOFError):
+            while text := input(question).strip():
+                with suppress(argparse.ArgumentTypeError):
+                    return _rate(text)
+        return None
+
+    marks = {"turned_deg": arguments.turned_deg, "drove_m": arguments.drove_m}
+    request = RobotRequest(arguments.config, arguments.set, marks, ask if sys.stdin.isatty() else None)
+    report = ROBOTS[arguments.robot](request)
+    print(report.render())
+    if arguments.output is not None:
+        report.write(arguments.output, str(arguments.config))
+        print(f"{arguments.output}: written; bench.json is what to send back")
+    return FAILED if report.faulty else 0
 
 
 def add_export(commands: Commands) -> None:

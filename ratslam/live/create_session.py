@@ -14,6 +14,7 @@ from ratslam.live.live_robot import LiveRobot, mapped_config, mapper_status
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
 from robot.live.create_rig import CreateRig, run_create_loop
+from robot.recordings.cdr import doubts_of
 from robot.simulation.create.simulated_session import describe_create
 from robot.simulation.create.state_machine import CreateState
 from robot.sources.source import SourceDescription
@@ -73,7 +74,10 @@ class CreateSession(LiveRobot):
             ends = ", ".join(f"{self._ends[end]} {end.name}" for end in StepEnd if end is not StepEnd.FREE)
             tell(f"{mapper_status(mapper)}{time:.0f} s, {state.name}, {ends}")
 
-        run_create_loop(self.rig, mapper, count)
+        try:
+            run_create_loop(self.rig, mapper, count)
+        finally:
+            mapper.warn(doubts_of([] if self.rig.doubt is None else [self.rig.doubt]))
 
     def report(self) -> dict[str, Any]:
         return super().report() | {

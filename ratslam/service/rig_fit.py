@@ -249,9 +249,13 @@ class Rig(NamedTuple):
         lines = aligned(rows) if self.quantities else []
         return "\n".join([*lines, *self.notes, *(f"not determined: {reason}" for reason in self.unknown)])
 
-    def file_text(self, record: str) -> str:
-        """The file that a configuration includes: the settings, below the table as comments."""
-        text = f"The rig from {record}, written by `python -m ratslam fit`.\n{self.render()}"
+    def file_text(self, record: str, command: str = "fit") -> str:
+        """The file that a configuration includes: the settings, below the table as comments.
+
+        Args:
+            record: from which they are. command: that writes it.
+        """
+        text = f"The rig from {record}, written by `python -m ratslam {command}`.\n{self.render()}"
         comment = "\n".join(f"# {line}".rstrip() for line in text.splitlines())
         settings = self.included()
         use = "# A configuration takes these settings, where it has none of its own, by `include: [FILE]`."

@@ -20,6 +20,7 @@ from robot.drivers.head.usb_protocol import to_radians
 from robot.drivers.outcome import SessionOutcome
 from robot.live.live_config import LiveConfig
 from robot.live.polling import AsyncMapper, HeadRig, OperatorStop, SessionFault, check_mapper, session_fault
+from robot.recordings.cdr import Event
 from robot.simulation.create import state_machine
 from robot.simulation.create.state_machine import CreateState, MachineState, motion_end, next_state
 from robot.simulation.create.strain_sensors import fixed_whiskers
@@ -63,6 +64,7 @@ class CreateRig(HeadRig):
         self.monitor = StrainMonitor(rate, period, self.create.strain_per_radian, len(fan.base))
         self._connections = 0  # of the whiskers, seen so far
         self._free = self.epoch  # newest time at which the bumper was not pressed
+        self.doubt: Event | None = None  # what speaks against the odometry
 
     def poll(self) -> None:
         """Reads the samples of the whiskers and the state of the robot; see `HeadRig`."""
@@ -118,6 +120,9 @@ class CreateRig(HeadRig):
 
         if motion.dt <= 0:
             self.wait_until(read, MAX_READ_TIME, SessionOutcome.ROBOT_SILENT, "a reading")
+        if self.doubt is None and (text := self.robot.doubt):
+            self.doubt = Event(self.now(), "remainders", text)
+            self.record_event(self.doubt.name, text)
         if self.robot.gap():
             self.record_event("discontinuity", "a reply of the robot was lost, perhaps with its motion")
         return motion

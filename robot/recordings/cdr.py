@@ -149,6 +149,7 @@ DOUBTFUL = {
     PIECE: "the odometry did not go on, and a piece of the map begins",
     "unusable": "messages could not be used",
     "garbage": "what came is no message",
+    "remainders": "the robot may lose parts of its motion",
 }
 """Events after which the input of a session is not clean, and what they say."""
 

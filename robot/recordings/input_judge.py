@@ -14,6 +14,7 @@ its place and a setting that cures it. The judge changes no pose: it only refuse
 | gap | a velocity held over `GAP` median intervals (1 s at least), over `JUMP` typical steps | error |
 | gap | the same while the robot stands; `LONG_GAP` intervals between poses or motions | warning |
 | publishers | over a tenth of the steps lead back to where the robot was before | error |
+| counts | steps are whole degrees or millimetres, most of one: what is below may be lost | warning |
 | precision | numbers at these coordinates lie apart by over a tenth of a typical step | warning |
 """
 
@@ -48,6 +49,8 @@ holds."""
 FAST, START, CRAWL, LEAST_PATH = 3.0, 15.0, 1e-3, 0.1
 """Speed, m/s, from which starts are judged, and the fastest of any robot, m/s²; speed and whole path of one
 that hardly moves, m/s and m."""
+LEAST_COUNTS, COUNTED = 60, 0.02
+"""Least number of steps that show whole units, and their largest error, units."""
 
 
 class UnitLimits(Settings):
@@ -206,6 +209,17 @@ def _judge_steps(
         yield finding
     elif jumps.any():
         yield _jump(steps, jumps, rows, limits)
+    for amounts, count, unit in ((steps.turn, np.radians(1), "degree"), (steps.length, 1e-3, "mm")):
+        moved = amounts[amounts > COUNTED * count] / count
+        off = np.abs(moved - np.round(moved))
+        if len(moved) >= LEAST_COUNTS and np.quantile(off, 0.99) < COUNTED and np.median(moved) < 1.5:
+            found = (
+                f"{(moved < 1.5).sum()} of {len(moved)} steps that are not 0 are 1 {unit}, all are whole ones"
+            )
+            cure = (
+                "a robot that loses the rest at each reading hardly reports this motion: read it less often"
+            )
+            yield _Finding(False, None, found, "", cure)
     path, speed = float(steps.length.sum()), steps.typical_length / (steps.interval or 1.0)
     if 0 < path < LEAST_PATH and speed < CRAWL:
         cure = "if these are kilometres, --set recording.odometry.length_scale=1000"

@@ -205,6 +205,17 @@ def test_headings_in_degrees_are_detected(turns):
         assert "multiply by pi/180" in str(error)
 
 
+@pytest.mark.parametrize(("rate", "said"), [(0.9, 1), (2.6, 0)])
+def test_whole_degrees_of_a_robot_that_turns_slowly_are_doubted(rate, said):
+    """A turn of some degrees a step, as whole degrees."""
+    turns = np.radians(np.diff(np.floor(rate * np.arange(301)), prepend=0.0))
+    motion = np.column_stack([np.full(301, 0.0173), np.zeros(301), turns, np.full(301, 0.05)])
+    found = judging.judge_motion(0.05 * np.arange(301), motion, "session")
+    assert len([line for line in found if "are 1 degree, all are whole ones" in line]) == said
+    motion[:, 2] *= np.linspace(0.9, 1.1, 301)  # no whole ones
+    assert not any("whole ones" in line for line in judging.judge_motion(0.05 * np.arange(301), motion, "s"))
+
+
 @pytest.mark.parametrize("rows", [0, 1, 2, 3])
 def test_an_empty_track_is_accepted(rows):
     still = MotionTrack(np.arange(rows) * 1.0, np.ones(rows, bool), np.zeros((rows, 4)), np.zeros((rows, 3)))

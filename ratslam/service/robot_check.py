@@ -1,0 +1,116 @@
+"""Bench checks of robots: each drives one, asks a few questions, and writes a page, a rig and a record.
+
+A robot of one's own is an entry of `ROBOTS`: a function that drives it, or reads a record, and judges it.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ratslam.runs.settings.run_config import load_config
+from ratslam.service.create_check import Verdict, judge_create
+from ratslam.service.rig_fit import Rig, aligned
+from robot.drivers.create.driver import CreateDriver
+from robot.drivers.create.driver_config import CreateConfig
+from robot.live.create_bench import Bench, BenchPlan, BenchRun, drive_bench, runs_of_data, runs_to_data
+from tactile.base.errors import InputError, tell
+from tactile.base.files import new_folder
+
+FORMAT = "ratslam-bench-1"
+FINE, UNKNOWN = "fine", "cannot tell"
+
+
+class RobotRequest(NamedTuple):
+    """What is checked.
+
+    Attributes:
+        config: configuration of a live session, or the JSON file of an earlier check. settings: replaced
+            ones. marks: what the user measured, by its name; None: not. ask: asks the user for a number;
+            None: nobody is asked.
+    """
+
+    config: Path
+    settings: list[str]
+    marks: dict[str, float | None]
+    ask: Callable[[str], float | None] | None = None
+
+
+class RobotReport(NamedTuple):
+    """What a check found. Attributes: record: all that was measured, as JSON values."""
+
+    verdicts: list[Verdict]
+    rig: Rig
+    record: dict[str, Any]
+
+    @property
+    def faulty(self) -> bool:
+        """Whether a fault was found."""
+        return any(verdict.found not in (FINE, UNKNOWN) for verdict in self.verdicts)
+
+    def render(self) -> str:
+        """The verdicts and the rig as text."""
+        rows = [(verdict.question, verdict.found, verdict.detail) for verdict in self.verdicts]
+        return "\n".join([*aligned(rows), "", self.rig.render()])
+
+    def write(self, folder: Path, name: str) -> None:
+        """Writes page.txt, rig.yaml and bench.json into a new folder."""
+        record = {"format": FORMAT, **self.record, "verdicts": [each._asdict() for each in self.verdicts]}
+        with new_folder(folder) as inside:
+            (inside / "page.txt").write_text(f"Check of {name}\n\n{self.render()}\n", encoding="utf-8")
+            rig = self.rig.file_text(name, "check robot")
+            (inside / "rig.yaml").write_text(rig, encoding="utf-8")
+            (inside / "bench.json").write_text(json.dumps(record), encoding="utf-8")
+
+
+def check_create(request: RobotRequest, plan: BenchPlan | None = None) -> RobotReport:
+    """Checks the odometry of a Create: it turns and drives for about four minutes, on 2 m of free floor."""
+    if request.config.suffix == ".json":
+        record = _read_record(request.config, "create")
+        create, runs = CreateConfig(**record["settings"]), [*runs_of_data(record["runs"])]
+        marks = {
+            **record["marks"],
+            **{key: value for key, value in request.marks.items() if value is not None},
+        }
+    else:
+        config = load_config(request.config, request.settings).live
+        if config is None or config.create is None:
+            raise InputError(f"{request.config}: live.create", "missing", "the settings of a Create")
+        fields = config.create.model_dump(include=set(CreateConfig.model_fields))
+        create = CreateConfig(**fields)
+        names, ask = list(request.marks), request.ask
+
+        def measure(run: BenchRun) -> float | None:
+            name = names[0 if run.turns else 1]
+            if request.marks[name] is not None or ask is None:
+                return request.marks[name]
+            return ask(f"How far was that, {'degrees' if run.turns else 'm'}? (Enter: not measured) ")
+
+        bench = Bench(CreateDriver, time.monotonic, time.sleep, measure)
+        runs, measured = drive_bench(create, plan or BenchPlan(), bench, tell)
+        marks = dict(zip(names, measured, strict=True))
+    verdicts, rig = judge_create(create, runs, *marks.values())
+    data = {"robot": "create", "settings": create.model_dump(mode="json"), "marks": marks}
+    return RobotReport(verdicts, rig, {**data, "runs": runs_to_data(runs)})
+
+
+def _read_record(file: Path, robot: str) -> dict[str, Any]:
+    """The record of an earlier check.
+
+    Raises:
+        InputError: it is not one of this robot.
+    """
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(str(file), f"cannot be read ({error})", "the bench.json of a check") from None
+    if not isinstance(record, dict) or (record.get("format"), record.get("robot")) != (FORMAT, robot):
+        raise InputError(str(file), "no such record", f"the bench.json of a check of `{robot}`")
+    return record
+
+
+ROBOTS: dict[str, Callable[[RobotRequest], RobotReport]] = {"create": check_create}
+"""The checks by the name of the robot."""
