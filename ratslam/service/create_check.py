@@ -69,7 +69,7 @@ def judge_create(
             quantities.append(
                 Quantity("wheel base", config.wheel_base, base, 1e-3 * base, "m", "live.create.wheel_base")
             )
-    lines = [_line(run, *pair) for run, *pair in zip(runs, expected, reported, strict=True)]
+    lines = [run.describe(*pair) for run, *pair in zip(runs, expected, reported, strict=True)]
     unknown = tuple(f"{each.question}: {each.detail}" for each in verdicts if each.found == "cannot tell")
     rig = Rig(tuple(quantities), {"live": {"create": settings | late}}, tuple(lines), unknown)
     return verdicts, rig if settings or late else rig._replace(settings={})
@@ -196,13 +196,3 @@ def _judge_scale(
     )
     quantity = Quantity(f"{name} scale", getattr(config, key), scale, sd, "", f"live.create.{key}")
     return Verdict(name, found, detail), quantity
-
-
-def _line(run: BenchRun, expected: np.ndarray, reported: np.ndarray) -> str:
-    """A run in words: what was reported of the commanded motion, and its scatter."""
-    commanded, found = expected.sum(), reported.sum()
-    ratio = found / commanded if commanded else np.nan
-    noise = float(np.std(reported - ratio * expected)) if len(expected) else np.nan
-    unit = "degrees" if run.turns else "mm"
-    said = f"reported {found:.1f} of {commanded:.1f} {unit} ({ratio:.3f}), noise {noise:.2f} a reading"
-    return f"{run.name}: {said}"

@@ -67,6 +67,15 @@ class BenchRun(NamedTuple):
             f"{'turn' if self.turns else 'drive'} of {self.amount:g} {unit} at {self.speed:g} {unit}/s, {how}"
         )
 
+    def describe(self, expected: np.ndarray, reported: np.ndarray) -> str:
+        """What was reported of the commanded motion [N] (degrees or mm of each reading), and its scatter."""
+        commanded, found = expected.sum(), reported.sum()
+        ratio = found / commanded if commanded else np.nan
+        noise = float(np.std(reported - ratio * expected)) if len(expected) else np.nan
+        unit = "degrees" if self.turns else "mm"
+        said = f"reported {found:.1f} of {commanded:.1f} {unit} ({ratio:.3f}), noise {noise:.2f} a reading"
+        return f"{self.name}: {said}"
+
 
 class BenchRobot(Protocol):
     """The methods of `robot.drivers.create.driver.CreateDriver` that a bench check calls."""
@@ -135,7 +144,7 @@ def drive_bench(
                 robot.refresh()
                 del rows[:-1]  # the last is from before the run
                 _drive_run(robot, run, bench)
-                done.append(run._replace(rows=np.array([*map(_row_of, rows)]).reshape(-1, 8)))
+                done.append(run._replace(rows=np.array([reading.row for reading in rows]).reshape(-1, 8)))
                 if len(marks) < 2:
                     marks.append(bench.measure(done[-1]))
     return done, marks
@@ -160,12 +169,6 @@ def _drive_run(robot: BenchRobot, run: BenchRun, bench: Bench) -> None:
     if robot.active_stop is not None:
         found, cure = f"the robot stopped: {robot.active_stop}", "clear its way and start the check again"
         raise InputError(run.name, found, "2 m of free, even floor", cure)
-
-
-def _row_of(reading: CreateReading) -> tuple[float, ...]:
-    reply = reading.reply
-    encoders = reply.encoders or (math.nan, math.nan)
-    return (reading.asked, reading.replied, *reading.expected, reply.millimetres, reply.degrees, *encoders)
 
 
 def runs_to_data(runs: list[BenchRun]) -> list[dict[str, Any]]:

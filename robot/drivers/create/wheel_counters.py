@@ -17,7 +17,7 @@ from tactile.base.types import Odometry
 
 LONG_WAY, LONG_TURN = 500.0, 400.0
 """Commanded motion after which a robot that loses remainders is read, mm and degrees."""
-FEW = 60
+LEAST_MOVING = 40
 """Readings of a moving robot from which on small ones are doubted."""
 
 
@@ -33,6 +33,12 @@ class CreateReading(NamedTuple):
     replied: float
     expected: tuple[float, float]
     reply: SensorReply
+
+    @property
+    def row(self) -> tuple[float, ...]:
+        """Asked, replied, expected, reported way (mm) and turn (degrees), encoders (NaN without)."""
+        encoders = self.reply.encoders or (math.nan, math.nan)
+        return (self.asked, self.replied, *self.expected, *self.reply[:2], *encoders)
 
 
 class WheelCounters:
@@ -50,7 +56,7 @@ class WheelCounters:
         self._speeds, self._since = (0, 0), time  # last command, mm/s right and left; end of `expected`
         self.expected = (0.0, 0.0)
         self._encoders: tuple[int, int] | None = None
-        self._few = self._moving = 0  # replies of a moving counter, and of these at most one unit
+        self._moving = np.zeros((2, 2), int)  # replies in motion, and of these at most one unit: way, turn
         self.due = True
 
     def command(self, right: int, left: int, time: float) -> None:
@@ -75,8 +81,8 @@ class WheelCounters:
             turn = math.degrees((right - left) / 1000 / self._config.wheel_base)
             return float(left + right) / 2, turn
         counts = reply.millimetres, reply.degrees
-        moving = [abs(count) <= 1 for count, much in zip(counts, expected, strict=True) if abs(much) > 0.01]
-        self._few, self._moving = self._few + sum(moving), self._moving + len(moving)
+        moves = np.abs(expected) > 0.01
+        self._moving += np.stack([moves, moves & (np.abs(counts) <= 1)])
         if self._config.remainders != "lost":
             return counts
         scales = self._config.distance_scale, self._config.turn_scale
@@ -88,12 +94,11 @@ class WheelCounters:
     @property
     def doubt(self) -> str:
         """What speaks against the sums of the replies; '' for nothing."""
-        if self._config.remainders != "unknown" or self._moving < FEW or 2 * self._few < self._moving:
-            return ""
-        return (
-            f"{self._few} of {self._moving} replies in motion are at most 1 mm or degree: if the robot loses "
-            "the rest, this motion is hardly reported; `python -m ratslam check robot create` tells"
-        )
+        for all, few, unit in zip(*self._moving, ("mm", "degree"), strict=True):
+            if self._config.remainders == "unknown" and all >= LEAST_MOVING and 2 * few >= all:
+                said = f"{few} of {all} replies in motion are 0 or 1 {unit}: if the robot loses the rest,"
+                return f"{said} this is hardly reported; `python -m ratslam check robot create` tells"
+        return ""
 
     def _expect(self, time: float) -> None:
         (right, left), seconds = self._speeds, time - self._since
