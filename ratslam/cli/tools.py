@@ -147,9 +147,12 @@ def add_check(commands: Commands) -> None:
     )  # fmt: skip
     robot.add_path("-o", "DIR", "write page.txt, rig.yaml and bench.json to a new folder")
     robot.add_argument(
-        "--turned-deg", type=_rate, metavar="DEG", help="how far the first turn really was, degrees"
+        "--turned-deg",
+        type=_positive_number,
+        metavar="DEG",
+        help="true amount of the first turn, degrees",
     )
-    robot.add_argument("--drove-m", type=_rate, metavar="M", help="how far the first drive really was, m")
+    robot.add_argument("--drove-m", type=_positive_number, metavar="M", help="true way of the first drive, m")
     add_set(robot)
     source, touch = kinds.parsers["source"], kinds.parsers["touch"]
     source.add_argument(
@@ -206,7 +209,7 @@ def _check_robot(arguments: argparse.Namespace) -> int:
         with suppress(EOFError):
             while text := input(question).strip():
                 with suppress(argparse.ArgumentTypeError):
-                    return _rate(text)
+                    return _positive_number(text)
         return None
 
     marks = {"turned_deg": arguments.turned_deg, "drove_m": arguments.drove_m}
@@ -233,7 +236,7 @@ def add_export(commands: Commands) -> None:
         "without a suffix becomes a ROS 2 bag folder", required=True,
     )  # fmt: skip
     export.add_argument(
-        "--peak-rate", type=_rate, default=20.0, metavar="HZ",
+        "--peak-rate", type=_positive_number, default=20.0, metavar="HZ",
         help="cells: rate of a cell at the peak of a settled packet (default 20 Hz)",
     )  # fmt: skip
     export.add_argument("--spike-seed", type=_seed, default=0, metavar="N", help="spikes: seed (default 0)")
@@ -252,8 +255,8 @@ def _export(arguments: argparse.Namespace) -> None:
     print(f"{arguments.output}: written")
 
 
-def _rate(text: str) -> float:
-    """Argument type of a rate in Hz."""
+def _positive_number(text: str) -> float:
+    """Argument type of a number above 0."""
     try:
         rate = float(text)
     except ValueError:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,12 +71,11 @@ class RobotReport(NamedTuple):
 def check_create(request: RobotRequest, plan: BenchPlan | None = None) -> RobotReport:
     """Checks the odometry of a Create: it turns and drives for about four minutes, on 2 m of free floor."""
     if request.config.suffix == ".json":
-        record = _read_record(request.config, "create")
-        create, runs = CreateConfig(**record["settings"]), [*runs_of_data(record["runs"])]
-        marks = {
-            **record["marks"],
-            **{key: value for key, value in request.marks.items() if value is not None},
-        }
+        with _reading(request.config, "create") as record:
+            create, runs = CreateConfig(**record["settings"]), [*runs_of_data(record["runs"])]
+            if len({run.turns for run in runs}) < 2:
+                raise ValueError("a turn and a drive")
+            marks = {name: value or record["marks"][name] for name, value in request.marks.items()}
     else:
         config = load_config(request.config, request.settings).live
         if config is None or config.create is None:
@@ -89,27 +90,34 @@ def check_create(request: RobotRequest, plan: BenchPlan | None = None) -> RobotR
                 return request.marks[name]
             return ask(f"How far was that, {'degrees' if run.turns else 'm'}? (Enter: not measured) ")
 
+        if ask is not None:
+            ask("The robot turns, then drives 1 m ahead. Mark its place and heading; Enter starts it. ")
         bench = Bench(CreateDriver, time.monotonic, time.sleep, measure)
         runs, measured = drive_bench(create, plan or BenchPlan(), bench, tell)
         marks = dict(zip(names, measured, strict=True))
     verdicts, rig = judge_create(create, runs, *marks.values())
-    data = {"robot": "create", "settings": create.model_dump(mode="json"), "marks": marks}
+    data = {
+        "robot": "create",
+        "version": version("ratslam"),
+        "settings": create.model_dump(mode="json"),
+        "marks": marks,
+    }
     return RobotReport(verdicts, rig, {**data, "runs": runs_to_data(runs)})
 
 
-def _read_record(file: Path, robot: str) -> dict[str, Any]:
-    """The record of an earlier check.
-
-    Raises:
-        InputError: it is not one of this robot.
-    """
+@contextmanager
+def _reading(file: Path, robot: str) -> Iterator[dict[str, Any]]:
+    """The record of an earlier check; what is wrong with it is an `InputError`."""
+    expected = f"the bench.json of a check of `{robot}`"
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(str(file), f"cannot be read ({error})", "the bench.json of a check") from None
-    if not isinstance(record, dict) or (record.get("format"), record.get("robot")) != (FORMAT, robot):
-        raise InputError(str(file), "no such record", f"the bench.json of a check of `{robot}`")
-    return record
+        if (record["format"], record["robot"]) != (FORMAT, robot):
+            raise InputError(str(file), f"{record['format']} of `{record['robot']}`", expected)
+        yield record
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(str(file), f"cannot be read ({type(error).__name__})", expected) from None
 
 
 ROBOTS: dict[str, Callable[[RobotRequest], RobotReport]] = {"create": check_create}

@@ -49,9 +49,8 @@ class CreateConfig(Settings):
     @model_validator(mode="before")
     @classmethod
     def _base_of_model(cls, data: Any) -> Any:
-        if isinstance(data, dict) and data.get("model") in MODELS:
-            return {"wheel_base": MODELS[data["model"]].wheel_base, **data}
-        return data
+        model = MODELS.get(str(data.get("model"))) if isinstance(data, dict) else None
+        return {"wheel_base": model.wheel_base, **data} if model else data
 
     @model_validator(mode="after")
     def _replies_fit(self) -> CreateConfig:

@@ -15,6 +15,7 @@ from robot.drivers.create.driver_config import CreateConfig
 from robot.drivers.create.protocol import MODELS, WRAP
 from robot.emulators.create.emulator_config import FirmwareConfig
 from robot.live.create_bench import BenchPlan, drive_bench, runs_of_data, runs_to_data
+from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tests.helpers.create_line import SimulatedBench, SimulatedDriver
 
@@ -148,6 +149,19 @@ def test_the_report_has_a_page_a_rig_and_a_record(tmp_path):
     (tmp_path / "create.yaml").write_text("include: [bench/rig.yaml]\nbackend: grid\n")
     assert abs(load_config(tmp_path / "create.yaml").live.create.turn_scale - 1 / 0.9) < 0.004
     assert json.loads((tmp_path / "bench/bench.json").read_text())["robot"] == "create"
+
+
+OTHERS = [
+    "", "[]", '{"format": "ratslam-bench-1", "robot": "create"}', '{"format": 1, "robot": "arm"}',
+    json.dumps({"format": "ratslam-bench-1", "robot": "create", "settings": {}, "marks": {}, "runs": []}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", OTHERS)
+def test_a_record_of_something_else_is_refused(text, tmp_path):
+    (tmp_path / "bench.json").write_text(text)
+    with pytest.raises(InputError, match="a check of `create`"):
+        check_create(RobotRequest(tmp_path / "bench.json", [], {"turned_deg": 353.0, "drove_m": None}))
 
 
 def test_a_robot_on_a_terminal_is_checked(tmp_path):
