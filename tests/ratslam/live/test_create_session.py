@@ -19,6 +19,7 @@ import pytest
 from evaluation.artifacts.run_reader import read_manifest
 from ratslam.runs.run import run
 from ratslam.runs.settings.run_config import load_config
+from ratslam.service.recording_check import diagnose_recording
 from robot.live.live_config import LiveConfig
 from robot.live.selftest import check_session
 from robot.recordings.mcap_reader import Recording
@@ -172,6 +173,8 @@ def test_a_session_is_repeated_to_the_bit(robot: CreateBench, tmp_path: Path) ->
         assert (session.directory / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
     for directory in (session.directory, tmp_path / "again"):  # at 20 readings a second
         assert any("replies in motion are 0 or 1 mm" in said for said in read_manifest(directory).warnings)
+    doctor = diagnose_recording(session.directory / "session.mcap").render()
+    assert "replies in motion are 0 or 1 mm" in doctor
     odometry = [sample.reading.odometry for sample in recording]
     assert len(odometry) == 6
     assert 0.03 < sum(step.dx for step in odometry) < 0.15  # steps of 9 mm, more on a busy machine

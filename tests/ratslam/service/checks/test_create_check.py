@@ -140,6 +140,15 @@ def test_without_marks_the_scales_are_unknown_and_the_rest_is_not():
     assert "turn_scale" in rig.included()["live"]["create"]
 
 
+@pytest.mark.parametrize(("stuck", "found"), [((5,), "fine"), ((5, 0.01), UNKNOWN)])
+def test_wheels_that_stick_at_low_speed_are_not_taken_for_lost_remainders(stuck, found):
+    _, runs, _, _ = checked(FirmwareConfig(), 0.258)
+    for run in runs:
+        run.rows[:, 4:6] *= run.speed not in stuck
+    verdicts, _ = judge_create(CreateConfig(), runs, 360.0, 1.0)
+    assert {each.question: each.found for each in verdicts}["remainders"] == found
+
+
 def test_the_report_has_a_page_a_rig_and_a_record(tmp_path):
     _, runs, verdicts, rig = checked(FirmwareConfig(turn_scale=0.9), 0.258)
     report = RobotReport(verdicts, rig, {"robot": "create", "runs": runs_to_data(runs)})
