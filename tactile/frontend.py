@@ -10,8 +10,9 @@ from tactile.base.settings import Settings
 from tactile.base.types import Cycle, Observation, Report, Whisk
 from tactile.calibration import Calibration, RestBaseline, RestBaselineConfig, follow_baseline
 from tactile.contact_threshold import ContactConfig, detect_contacts
+from tactile.pokes import PokeConfig, image_depths, poke_points
 from tactile.wall_estimation.report_frontend import ReportFrontendConfig
-from tactile.whisker_geometry import HeadConfig, ur10_head
+from tactile.whisker_geometry import HeadConfig, image_points, ur10_head
 from tactile.whisker_image import ImageConfig, view_shape, whisk_observation
 
 
@@ -26,10 +27,26 @@ class TouchConfig(Settings):
     """Tracking of the whiskers' baselines; none keeps those of the calibration."""
     image: ImageConfig = ImageConfig()
     """Whisker image."""
+    pokes: PokeConfig = PokeConfig()
+    """Pokes of an arm without a whisker head."""
     reports: ReportFrontendConfig = ReportFrontendConfig()
     """Front end of a Create's reports: contacts and wall directions."""
     frontend: PluginConfig | None = None
     """A registered front end (`ratslam.touch`) in place of ours."""
+
+
+def touched_points(config: TouchConfig, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where touch images [..., D] met something: points [..., D, 2] in base_link, m, and [..., D] bool, there
+    is one. An image has a pixel per whisker of the head, or per poke of an arm without one."""
+    if np.shape(image)[-1] == config.pokes.directions:
+        depth, there = image_depths(config.pokes, image)
+        return poke_points(config.pokes, depth), there
+    return image_points(ur10_head(config.head), image, config.image.tallest)
+
+
+def has_points(config: TouchConfig, pixels: int) -> bool:
+    """Whether images of so many pixels are touch images of this configuration."""
+    return pixels in (config.pokes.directions, len(ur10_head(config.head).length))
 
 
 class Frontend:

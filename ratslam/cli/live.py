@@ -150,7 +150,8 @@ def _emulate(arguments: argparse.Namespace) -> int:
         elif arguments.device == "ur10":
             from robot.emulators.ur10 import serve
 
-            serve(arm_emulator_config(session, head, arguments.host).model_copy(update=opened))
+            radius = config.touch.pokes.radius
+            serve(arm_emulator_config(session, head, arguments.host, radius).model_copy(update=opened))
         else:
             from robot.emulators.head import serve as serve_head
 

@@ -1,5 +1,5 @@
-"""A live session on an arm with a whisker head: self-test, calibration, route, whisks; and the steering to
-goals by the estimates of the mapper."""
+"""A live session on an arm: self-test, calibration, route, and whisks of its head or, without one, pokes; and
+the steering to goals by the estimates of the mapper."""
 
 from __future__ import annotations
 
@@ -21,9 +21,12 @@ from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live import arm_route
-from robot.live.live_rig import Rig
+from robot.live.live_config import LiveConfig
+from robot.live.live_rig import ArmRig, Rig
+from robot.live.poke_loop import PokeReport, learn_free_pokes, run_poke_loop
 from robot.live.polling import SessionFault, session_fault
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
+from robot.simulation.head.simulated_pokes import moved_length
 from robot.sources.source import SourceDescription, SourceInfo
 from robot.world.maze import POSE_CELL_SIZE
 from robot.world.scene import HeadPath, maze_info
@@ -57,7 +60,7 @@ def plan_goals(config: RunConfig) -> tuple[RunConfig, GoalRoute]:
     made = saved.open_session().map
     planner = GoalPlanner(made.graph(), goal, live.plan.motion)
     drive = GoalDrive(goal, planner, saved.config.pose_cells.cell_size)
-    contacts = contact_map(made, config.touch.image, ur10_head(config.touch.head))
+    contacts = contact_map(made, config.touch)
     return localising(config, saved, goal.start), GoalRoute(drive, live, contacts)
 
 
@@ -65,13 +68,15 @@ class GoalSteering:
     """The route of the whisk loop (`robot.live.arm_route.ArmRoute`) that follows the newest estimate.
 
     Args:
-        whisks: reports of the whisks passed on so far; the list grows.
+        whisks: reports of the whisks, or rings of pokes, passed on so far; the list grows.
 
     Attributes:
         ends: of the goals so far, as JSON values.
     """
 
-    def __init__(self, route: GoalRoute, rig: Rig, mapper: Mapper, whisks: Sequence[WhiskReport]) -> None:
+    def __init__(
+        self, route: GoalRoute, rig: ArmRig, mapper: Mapper, whisks: Sequence[WhiskReport | PokeReport]
+    ) -> None:
         self.route, self.ends = route, list[dict[str, Any]]()
         self._rig, self._mapper, self._whisks = rig, mapper, whisks
         self._mapped = self._seen = 0  # results taken; whisks that the route has taken note of
@@ -120,7 +125,7 @@ class GoalSteering:
             self._rig.record_event("goal", text)
 
 
-def prepare_arm_session(config: RunConfig, directory: Path) -> Callable[[Callable[[], bool]], ArmSession]:
+def prepare_arm_session(config: RunConfig, directory: Path) -> Callable[[Callable[[], bool]], _ArmSession]:
     """Checks the route of a session, all of its targets; returns the function that opens the devices.
 
     Raises:
@@ -131,10 +136,11 @@ def prepare_arm_session(config: RunConfig, directory: Path) -> Callable[[Callabl
     assert config.live is not None
     path = arm_route.plan_path(config.live, ur10_head(config.touch.head))
     arm_route.check_targets(config.live, path)
-    return lambda stopped: ArmSession(config, path, directory, stopped, goals)
+    session = PokeSession if config.live.arm.touch == "force" else WhiskSession
+    return lambda stopped: session(config, path, directory, stopped, goals)
 
 
-class ArmSession(LiveRobot):
+class _ArmSession(LiveRobot):
     """The arm's part of a session.
 
     Args:
@@ -142,8 +148,7 @@ class ArmSession(LiveRobot):
             there are any.
     """
 
-    unit = "whisk"
-    rig: Rig
+    rig: ArmRig
 
     def __init__(
         self,
@@ -156,35 +161,88 @@ class ArmSession(LiveRobot):
         assert config.live is not None
         self._config = config
         self._approach, self._descent, self._route = arm_route.arm_routes(config.live, path)
-        self.rig = Rig(config.live, config.touch.head, stopped)
         live, plan, head = config.live, config.live.plan, ur10_head(config.touch.head)
-        whole, rate = arm_route.whole_path(live, head), plan.whisking.rate
-        rows = ceil(1.5 * whole.duration * rate) if live.whisks is None else live.whisks
+        self._open_rig(live, stopped)
+        whole = arm_route.whole_path(live, head)
+        rows = ceil(1.5 * self._readings_along(whole)) if live.whisks is None else live.whisks
         maze = (
             None if live.waypoints else maze_info(arm_route.plan_scene(plan, head).maze, plan.maze, plan.seed)
         )
         provenance = {"live": live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})}
-        info = SourceInfo(
-            raw_whiskers=True,
-            cell_size=POSE_CELL_SIZE,
-            head=config.touch.head,
-            maze=maze,
-            provenance=provenance,
-        )
-        source = SourceDescription(view_shape(config.touch.image, head), len(head.length), rate, info)
+        info = SourceInfo(cell_size=POSE_CELL_SIZE, maze=maze, provenance=provenance)
         extent = float(np.abs(whole.pose[:, :2] - whole.pose[0, :2]).max())
-        self.job = MappingJob(mapped_config(config, directory, rows), source, directory, extent)
-        self.total = live.whisks or (None if goals else ceil(path.duration * rate))
+        self.job = MappingJob(mapped_config(config, directory, rows), self._describe(info), directory, extent)
+        self.total = live.whisks or (None if goals else ceil(self._readings_along(path)))
         self._goals = goals
         self._steering: GoalSteering | None = None
-        self._whisks: list[WhiskReport] = []
-        self._dropped = self._lost = 0
+        self._reports: list[WhiskReport | PokeReport] = []
+
+    def _open_rig(self, live: LiveConfig, stopped: Callable[[], bool]) -> None:
+        """Sets `rig`."""
+        raise NotImplementedError
+
+    def _readings_along(self, path: HeadPath) -> float:
+        """Expected number of readings along a path."""
+        raise NotImplementedError
+
+    def _describe(self, info: SourceInfo) -> SourceDescription:
+        """The readings of the session."""
+        raise NotImplementedError
 
     @property
     def end(self) -> SessionOutcome:
         """The outcome of a session that ends as planned."""
         steered = self._steering is not None and self._steering.route.drive.finished
         return SessionOutcome.REACHED if steered else SessionOutcome.COMPLETE
+
+    def run(self, mapper: Mapper, tell: Callable[[str], None]) -> None:
+        route: arm_route.ArmRoute = self._route
+        if self._goals is not None:
+            route = self._steering = GoalSteering(self._goals, self.rig, mapper, self._reports)
+        self._run_loop(route, mapper, tell)
+        fault = self._steering and self._steering.fault()
+        if fault:
+            raise fault
+
+    def _run_loop(self, route: arm_route.ArmRoute, mapper: Mapper, tell: Callable[[str], None]) -> None:
+        """Passes on the readings along a route."""
+        raise NotImplementedError
+
+    def _count(self, report: WhiskReport | PokeReport, mapper: Mapper) -> str:
+        """Counts a reading; returns the state of mapper and steering as text."""
+        self._reports.append(report)
+        self.count += 1
+        return f"{mapper_status(mapper)}{self._steering.status() if self._steering else ''}"
+
+    def report(self) -> dict[str, Any]:
+        return {
+            **({} if self._steering is None else {"goals": self._steering.ends}),
+            "state_age_s": quantiles(self.rig.state_ages),
+        }
+
+
+class WhiskSession(_ArmSession):
+    """The part of a session of an arm with a whisker head."""
+
+    unit = "whisk"
+    rig: Rig
+
+    def _open_rig(self, live: LiveConfig, stopped: Callable[[], bool]) -> None:
+        self.rig = Rig(live, self._config.touch.head, stopped)
+        self._dropped = self._lost = 0
+        self._lateness = list[float]()
+
+    def _readings_along(self, path: HeadPath) -> float:
+        assert self._config.live is not None
+        return path.duration * self._config.live.plan.whisking.rate
+
+    def _describe(self, info: SourceInfo) -> SourceDescription:
+        config = self._config
+        assert config.live is not None
+        head = ur10_head(config.touch.head)
+        info = info.model_copy(update={"raw_whiskers": True, "head": config.touch.head})
+        shape, rate = view_shape(config.touch.image, head), config.live.plan.whisking.rate
+        return SourceDescription(shape, len(head.length), rate, info)
 
     def calibrate(self, log: Callable[[str], None]) -> Calibration:
         """Records free whisks above the start of the route."""
@@ -205,29 +263,60 @@ class ArmSession(LiveRobot):
         whisking = self.rig.config.plan.whisking
         self.rig.driver.whisk(whisking, calibration.threshold[:, 1], calibration.mean[:, 1])
 
-    def run(self, mapper: Mapper, tell: Callable[[str], None]) -> None:
+    def _run_loop(self, route: arm_route.ArmRoute, mapper: Mapper, tell: Callable[[str], None]) -> None:
         def count(whisk: WhiskReport) -> None:
-            self._whisks.append(whisk)
-            self.count += 1
+            self._lateness.append(whisk.lateness)
             self._dropped, self._lost = self._dropped + (not whisk.seen), self._lost + whisk.missing
-            late = f"late {1e3 * whisk.lateness:.0f} ms"
             lost = f"{self._lost} samples lost, {self._dropped} images dropped"
-            steering = self._steering.status() if self._steering else ""
-            tell(f"{mapper_status(mapper)}{steering}{late}, {lost}")
+            tell(f"{self._count(whisk, mapper)}late {1e3 * whisk.lateness:.0f} ms, {lost}")
 
-        route: arm_route.ArmRoute = self._route
-        if self._goals is not None:
-            route = self._steering = GoalSteering(self._goals, self.rig, mapper, self._whisks)
         run_whisk_loop(self.rig, route, mapper, count)
-        fault = self._steering and self._steering.fault()
-        if fault:
-            raise fault
 
     def report(self) -> dict[str, Any]:
+        head = self.rig.head
         return super().report() | {
+            "head": head.decoder.counts._asdict() | {"stalls": head.stalls},
             "dropped": self._dropped,
             "missing": self._lost,
-            **({} if self._steering is None else {"goals": self._steering.ends}),
-            "lateness_s": quantiles([whisk.lateness for whisk in self._whisks]),
-            "state_age_s": quantiles(self.rig.state_ages),
+            "lateness_s": quantiles(self._lateness),
         }
+
+
+class PokeSession(_ArmSession):
+    """The part of a session of an arm without a head, which pokes (`tactile.pokes`)."""
+
+    unit = "ring"
+
+    def _open_rig(self, live: LiveConfig, stopped: Callable[[], bool]) -> None:
+        self.rig = ArmRig(live, stopped)
+        self._threshold = 0.0
+
+    def _readings_along(self, path: HeadPath) -> float:
+        return float(moved_length(path)[-1]) / self._config.touch.pokes.every + 1
+
+    def _describe(self, info: SourceInfo) -> SourceDescription:
+        directions = self._config.touch.pokes.directions
+        return SourceDescription((1, directions, 1), directions, 0.0, info)
+
+    def calibrate(self, log: Callable[[str], None]) -> None:
+        """Pokes in free air above the start of the route."""
+        log("arm: moving above the start of the route")
+        follow_route(self.rig, self._approach)
+        log(f"arm: {self._config.touch.pokes.directions} pokes in free air")
+        self._threshold = learn_free_pokes(self.rig, self._config.touch.pokes)
+        log(f"arm: a rise of {self._threshold:.1f} N is a contact")
+
+    def lower(self, calibration: Calibration | None) -> None:
+        """Lowers the tool."""
+        del calibration
+        follow_route(self.rig, self._descent)
+
+    def _run_loop(self, route: arm_route.ArmRoute, mapper: Mapper, tell: Callable[[str], None]) -> None:
+        def count(ring: PokeReport) -> None:
+            felt = f"{int(ring.contact.sum())} of {len(ring.contact)} pokes touched, {ring.took:.0f} s"
+            tell(f"{self._count(ring, mapper)}{felt}")
+
+        run_poke_loop(self.rig, route, mapper, self._config.touch.pokes, self._threshold, count)
+
+    def report(self) -> dict[str, Any]:
+        return super().report() | {"threshold_N": self._threshold}

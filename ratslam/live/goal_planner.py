@@ -21,8 +21,7 @@ from robot.world.scene import MotionConfig
 from tactile.base.errors import InputError
 from tactile.base.files import make_new_file
 from tactile.base.types import Observation
-from tactile.whisker_geometry import Head, image_points, ur10_head
-from tactile.whisker_image import ImageConfig
+from tactile.frontend import TouchConfig, has_points, touched_points
 
 if TYPE_CHECKING:
     import networkx
@@ -71,29 +70,31 @@ class GoalPlanner:
         return route.find_way(graph, start, goals, config.mode).poses
 
 
-def contact_map(made: Map, image: ImageConfig, head: Head) -> RememberedContacts:
-    """The contacts of the keyframes of a map; those of none if it has no whisker images of this head."""
-    return RememberedContacts(*_keyframe_contacts(made, image, head), RECENT)
+def contact_map(made: Map, touch: TouchConfig) -> RememberedContacts:
+    """The contacts of the keyframes of a map; those of none if it has no touch images of this kind."""
+    return RememberedContacts(*_keyframe_contacts(made, touch), RECENT)
 
 
-def _keyframe_contacts(made: Map, image: ImageConfig, head: Head) -> tuple[np.ndarray, list[np.ndarray]]:
+def _keyframe_contacts(made: Map, touch: TouchConfig) -> tuple[np.ndarray, list[np.ndarray]]:
     """Poses [n, 3] of the keyframes, and the contacts [m, 2] of each in base_link, m."""
     if not isinstance(made, KeyframeMap) or not isinstance(made.appearance, WhiskerAppearance):
         return np.zeros((0, 3)), []
     poses = made.solution().pose.rows
     levels, _ = made.appearance.stored(np.arange(len(poses)))
-    if levels.shape[1] < len(head.length):
+    count = levels.shape[1] // (1 + touch.image.radial)
+    if not has_points(touch, count):
         return np.zeros((0, 3)), []
-    points, there = image_points(head, level_heights(levels[:, : len(head.length)]), image.tallest)
+    points, there = touched_points(touch, level_heights(levels[:, :count]))
     return poses, [seen[touched] for seen, touched in zip(points, there, strict=True)]
 
 
-def felt_points(observation: Observation, image: ImageConfig, head: Head) -> np.ndarray:
-    """[n, 2] contact points of a whisker image in base_link, m."""
+def felt_points(observation: Observation, touch: TouchConfig) -> np.ndarray:
+    """[n, 2] contact points of a touch image in base_link, m."""
     pixels = observation.view[..., 0].reshape(-1)
-    if not len(pixels) == len(head.length) == len(observation.alive) or not observation.view_seen:
+    known = has_points(touch, len(pixels)) and len(pixels) == len(observation.alive)
+    if not known or not observation.view_seen:
         return np.asarray(observation.point)[observation.contact]
-    points, there = image_points(head, pixels, image.tallest)
+    points, there = touched_points(touch, pixels)
     return points[there & observation.alive]
 
 
@@ -170,7 +171,7 @@ def draw_map_way(path: Path, made: Map, saved: SavedMap, way: route.Way) -> None
     row = {place: k for k, place in enumerate(graph)}
     nodes = np.array([[data["x"], data["y"]] for _, data in graph.nodes(data=True)])
     links = np.array([[row[a], row[b]] for a, b in graph.edges()]).reshape(-1, 2)
-    felt = placed_points(*_keyframe_contacts(made, config.touch.image, ur10_head(config.touch.head)))
+    felt = placed_points(*_keyframe_contacts(made, config.touch))
     title = f"From experience {way.experiences[0]} to {way.experiences[-1]}"
     line = f"{way.length:.2f} m, {way.seconds:.0f} s over {len(way.experiences)} of {len(nodes)} experiences"
     figure = draw_way(title, line, nodes, links, way.poses, felt)

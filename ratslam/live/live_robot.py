@@ -14,7 +14,8 @@ from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live.create_rig import CreateRig
-from robot.live.live_rig import Rig
+from robot.live.live_rig import ArmRig
+from robot.live.polling import HeadRig
 from robot.live.selftest import find_devices, start_and_check
 from robot.live.topics_rig import TopicsRig
 from robot.recordings.recording_config import RecordingConfig
@@ -35,7 +36,7 @@ class LiveRobot:
     """
 
     unit: str
-    rig: Rig | CreateRig | TopicsRig
+    rig: ArmRig | CreateRig | TopicsRig
     job: MappingJob
     view: str | None = None
     resume: Path | None = None
@@ -71,7 +72,7 @@ class LiveRobot:
 
     def report(self) -> dict[str, Any]:
         """What it adds to the report of the session, as JSON values."""
-        assert not isinstance(self.rig, TopicsRig)
+        assert isinstance(self.rig, HeadRig)
         head = self.rig.head
         return {"head": head.decoder.counts._asdict() | {"stalls": head.stalls}}
 

@@ -29,7 +29,6 @@ from robot.recordings.cdr import PIECE
 from robot.sources.source import ClosedSource, Sample, SourceDescription
 from tactile.base.errors import InputError
 from tactile.calibration import Calibration
-from tactile.whisker_geometry import ur10_head
 
 LOG = "mapper.log"
 """Log of the mapper process, in the run directory."""
@@ -306,7 +305,7 @@ def _map(line: Connection) -> None:
                 (step,) = runner.process([sample])
                 took = time.monotonic() - fed.received
                 estimate, touch = step.estimate, config.touch
-                points = felt_points(sample.reading, touch.image, ur10_head(touch.head))
+                points = felt_points(sample.reading, touch)
                 result = MappedSample(
                     fed.count - 1, np.asarray(step.pose), int(estimate.place), took, step.doubt,
                     bool(estimate.lost), points, np.asarray(estimate.spread, float),

@@ -19,7 +19,7 @@ from ratslam.mapping.ground import Ground
 from ratslam.places.localiser import Place, Visits
 from ratslam.recall.whisker_likelihood import PixelLayout, level_heights
 from tactile.base.se2 import compose
-from tactile.whisker_geometry import Head, image_points
+from tactile.frontend import TouchConfig, has_points, touched_points
 
 RADIUS = 1.5
 """Radius within which signs are summed, as a multiple of the ground's reach."""
@@ -133,24 +133,23 @@ def _peaks(signs: Signs, radius: float) -> list[tuple[int, float, np.ndarray]]:
     return peaks
 
 
-def session_changes(place: Place, visits: Visits, head: Head, tallest: float) -> list[Change]:
+def session_changes(place: Place, visits: Visits, touch: TouchConfig) -> list[Change]:
     """The places at which a session does not agree with the map, the surest first; none for maps of other
-    images than those of the head's whiskers.
+    images than touch.
 
     Args:
-        visits: of the session; `Change.keyframes` number them. head, tallest: how whisker images become
-            points: the head, and the height (m) of pixel value 1 and of walls.
+        visits: of the session; `Change.keyframes` number them. touch: how touch images become points.
     """
     appearance, likeness = place.map.appearance, place.map.appearance.metric().likeness
     if not isinstance(appearance, WhiskerAppearance) or not likeness.size:
         return []
-    if len(appearance.layout.group) != len(head.length) or not len(visits.step):
+    if not has_points(touch, len(appearance.layout.group)) or not len(visits.step):
         return []
 
     def contacts_of(frames: np.ndarray) -> ContactMap:
         ground = place.ground._replace(poses=place.map.solution().pose.rows[frames])
         levels = appearance.stored(frames)[0].astype(int)
-        return ContactMap(ground, levels, appearance.layout, likeness, head, tallest)
+        return ContactMap(ground, levels, appearance.layout, likeness, touch)
 
     radius = RADIUS * place.ground.reach
     count = np.full(len(visits.step), len(place.frames))
@@ -168,23 +167,22 @@ class ContactMap(NamedTuple):
 
     Attributes:
         ground: the keyframes. levels: [N, D] of their images. layout: of the pixels. log_odds: [G, LEVELS,
-            LEVELS], see `log_odds_table`. head, tallest: see `image_points`.
+            LEVELS], see `log_odds_table`. touch: see `touched_points`.
     """
 
     ground: Ground
     levels: np.ndarray
     layout: PixelLayout
     log_odds: np.ndarray
-    head: Head
-    tallest: float
+    touch: TouchConfig
 
 
 def contact_points(
-    poses: np.ndarray, levels: np.ndarray, head: Head, tallest: float
+    poses: np.ndarray, levels: np.ndarray, touch: TouchConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """[n, D, 2] contact points (m) of images [n, D] of levels taken at poses [n, 3], and [n, D] bool,
     there is one."""
-    points, touched = image_points(head, level_heights(levels), tallest)
+    points, touched = touched_points(touch, level_heights(levels))
     body = np.concatenate([points, np.zeros((*points.shape[:-1], 1))], axis=-1)
     return compose(poses[:, None], body)[..., :2], touched
 
@@ -197,8 +195,8 @@ def contact_signs(made: ContactMap, poses: np.ndarray, levels: np.ndarray, known
             the map with which each is compared.
     """
     ground, found = made.ground, [(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0), np.zeros(0))]
-    remembered, _ = contact_points(ground.poses, made.levels, made.head, made.tallest)
-    points, touched = contact_points(poses, levels, made.head, made.tallest)
+    remembered, _ = contact_points(ground.poses, made.levels, made.touch)
+    points, touched = contact_points(poses, levels, made.touch)
     for k, pose in enumerate(poses):
         shift, frame = ground.near(pose, ground.reach, ground.reach_heading)
         near = shift[frame < known[k]], frame[frame < known[k]]

@@ -16,6 +16,7 @@ from ratslam.runs.settings.completion import complete
 from ratslam.runs.settings.run_config import RunConfig, load_config
 from robot.recordings.formats import open_recording
 from robot.simulation.create.simulated_session import CreateSimulation
+from robot.simulation.head.simulated_pokes import PokeSimulation
 from robot.simulation.head.simulated_session import HeadSimulation
 from robot.simulation.rat.simulated_session import RatSimulation
 from robot.sources.source import SOURCES, Sample, Source
@@ -92,6 +93,8 @@ def open_source(
         return CreateSimulation(config.create_simulation)
     if config.rat_simulation is not None:
         return RatSimulation(config.rat_simulation)
+    if config.simulation is not None and config.simulation.touch == "force":
+        return PokeSimulation(config.simulation, config.touch.pokes)
     if config.simulation is not None:
         session = HeadSimulation(config.simulation, config.touch.head)
         if report is not None:

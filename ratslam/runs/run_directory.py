@@ -191,8 +191,7 @@ def true_grid(arena: Arena, grid: OccupancyGrid) -> GridTruth:
 
 def changes_of(localiser: Localiser, config: TouchConfig) -> list[Change]:
     """The places at which a localised session does not agree with its map, the surest first."""
-    head, tallest = ur10_head(config.head), config.image.tallest
-    return session_changes(localiser.place, localiser.visits(), head, tallest)
+    return session_changes(localiser.place, localiser.visits(), config)
 
 
 class OnlineErrorLog:

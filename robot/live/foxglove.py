@@ -10,6 +10,7 @@ from version 3 on (`foxglove.sdk.v1`) send too.
 from __future__ import annotations
 
 import json
+import logging
 import ssl
 import struct
 import threading
@@ -32,6 +33,9 @@ SUBPROTOCOLS: tuple[Any, ...] = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 RETRY, LONGEST_RETRY = 0.1, 2.0
 """Waiting time before a lost connection is made again, at first and at most, s."""
 START = "on the robot: `ros2 launch foxglove_bridge foxglove_bridge_launch.xml`"
+_QUIET = logging.getLogger("ratslam.foxglove")
+_QUIET.addHandler(logging.NullHandler())
+_QUIET.propagate = False  # what is wrong with a connection is a notice; the library logs tracebacks
 _MESSAGE = struct.Struct("<BIQ")  # opcode, subscription, time of the server in ns
 
 
@@ -176,6 +180,7 @@ def _connect(address: str) -> tuple[Any, ExitStack]:
         opened = connect(
             address, subprotocols=SUBPROTOCOLS, compression=None, proxy=None, max_size=LARGEST,
             open_timeout=CONNECT_TIMEOUT, close_timeout=1.0, ping_interval=5.0, ping_timeout=10.0,
+            logger=_QUIET,
         )  # fmt: skip
         socket = stack.enter_context(opened)
     except ssl.SSLError as error:

@@ -122,7 +122,7 @@ class LiveConfig(Settings):
     waypoints: tuple[tuple[float, float, float], ...] = ()
     """Route instead of the plan's: x, y (m) and heading (degrees) in the map."""
     whisks: PositiveInt | None = None
-    """Number of whisks; None: until the end of the route."""
+    """Number of whisks, or of rings of pokes; None: until the end of the route."""
     odometry: Literal["pose", "velocity"] = "pose"
     """Odometry from the arm's poses at the middle of two protractions, or from the mean velocity between
     them."""
@@ -154,6 +154,8 @@ class LiveConfig(Settings):
         given = [name for name in ARM_ONLY if name in self.model_fields_set]
         if self.create is not None and given:
             raise ValueError(f"create and {', '.join(given)}: a session has one robot, a Create or an arm")
+        if self.plan.touch == "force":
+            raise ValueError("plan.touch: what a real arm feels with is `live.arm.touch`")
         given = [name for name in ("create", *ARM_ONLY) if name in self.model_fields_set - {"budget"}]
         if self.topics is not None and given:
             raise ValueError(f"topics and {', '.join(given)}: a session has one robot")

@@ -10,20 +10,33 @@ import numpy as np
 from robot.drivers.head.driver_config import Address
 from robot.emulators.create.emulator_config import CreateEmulatorConfig, CreateWorldConfig, FirmwareConfig
 from robot.emulators.head.emulator_config import BridgeEmulatorConfig, HeadEmulatorConfig
-from robot.emulators.ur10.emulator_config import UrEmulatorConfig
-from robot.live.arm_route import plan_path
+from robot.emulators.ur10.emulator_config import PokedWallsConfig, UrEmulatorConfig
+from robot.live.arm_route import plan_path, plan_scene
 from robot.live.live_config import CreateLiveConfig, LiveConfig
 from robot.simulation.head.beam import StreamConfig
 from tactile.base.errors import InputError
+from tactile.pokes import PokeConfig
 from tactile.whisker_geometry import HeadConfig, ur10_head
 
 
-def arm_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> UrEmulatorConfig:
+def arm_emulator_config(
+    config: LiveConfig, head: HeadConfig, host: str | None = None, radius: float = PokeConfig().radius
+) -> UrEmulatorConfig:
     """A controller at the session's address, or another one; the arm starts above the first pose of the
-    route."""
+    route. Where the arm pokes, its tool of this radius (m) meets the walls of the plan's maze."""
     arm, first = config.arm, plan_path(config, ur10_head(head)).pose[0]
     start = np.asarray(arm.placing.tcp_from_pose(first, config.lift / 2))
-    return UrEmulatorConfig(host=host or arm.host, hz=arm.hz, start=tuple(start.tolist()))
+    walls = None
+    if arm.touch == "force":
+        boxes = () if config.waypoints else plan_scene(config.plan, ur10_head(head)).surroundings.walls.box
+        walls = PokedWallsConfig(
+            boxes=tuple(map(tuple, np.asarray(boxes).tolist())),
+            placing=arm.placing,
+            radius=radius,
+            force=config.plan.force,
+            seed=config.seed,
+        )
+    return UrEmulatorConfig(host=host or arm.host, hz=arm.hz, start=tuple(start.tolist()), poked=walls)
 
 
 def head_emulator_config(config: LiveConfig, head: HeadConfig, host: str | None = None) -> HeadEmulatorConfig:

@@ -23,7 +23,7 @@ from robot.drivers.ur10 import dashboard
 from robot.drivers.ur10.arm import Arm
 from robot.drivers.ur10.driver_config import tcp_heading
 from robot.live.live_config import LiveConfig
-from robot.live.polling import TICK, HeadRig, OperatorStop, SessionFault, session_fault
+from robot.live.polling import TICK, HeadRig, OperatorStop, PolledRig, SessionFault, session_fault
 from robot.simulation.head.odometry_errors import OdometryErrors, motions_between
 from robot.sources.odometry import from_velocities
 from tactile.base.random_streams import stream
@@ -108,39 +108,28 @@ MAX_REST_TIME, REST_TIME = 2.0, 0.3
 """Longest wait for a stopped arm, and required time at rest, s: after a contact it stops, then backs off."""
 
 
-class Rig(HeadRig):
-    """The two devices of a session; a context manager that leaves both at rest.
+class ArmRig(PolledRig):
+    """The arm of a session; a context manager that leaves it at rest.
 
     Attributes:
-        arm, head, driver: the devices. odometer: of the arm. state_ages: age of the newest state at each
-            poll, s.
+        arm: the arm. odometer: its odometry. state_ages: age of the newest state at each poll, s.
     """
 
-    def __init__(self, config: LiveConfig, head: HeadConfig, stopped: Callable[[], bool]) -> None:
-        self.shape = ur10_head(head)
+    def __init__(self, config: LiveConfig, stopped: Callable[[], bool]) -> None:
+        PolledRig.__init__(self, config, stopped)
         self.arm = Arm(config.arm)
-        shape, link = self.shape, config.head
-
-        def stop(whisker: int) -> None:
-            self.arm.fail(SessionOutcome.CONTACT, f"whisker {whisker} is bent beyond the overload limit")
-
-        reader = HeadReader(
-            lambda: open_bridge(link.address), len(shape.length), link, alive=shape.alive, on_overload=stop
-        )
-        self.driver = HeadDriver(reader, self.shape)
-        super().__init__(config, reader, stopped)
         self.odometer = ArmOdometry(config)
         self.state_ages: list[float] = []
         self._arm_clock = ClockSync()
         self._seen = 0
 
     def poll(self) -> None:
-        """Reads the data of both devices; see `HeadRig`."""
-        for frames, arrival in self.stream.take():
-            if self.recorder is not None:
-                self.recorder.add_frames(frames, arrival - self.epoch)
+        """Reads the states of the arm; see `PolledRig`."""
         self._take_states()
-        fault = self.arm.fault or self.stream.fault or (self.recorder and self.recorder.fault)
+        self._check()
+
+    def _check(self) -> None:
+        fault = self.arm.fault or (self.recorder and self.recorder.fault)
         if fault:
             raise SessionFault(fault)
         if self._arm_clock.jumps:
@@ -154,10 +143,9 @@ class Rig(HeadRig):
         self.state_ages = []
 
     def rest(self) -> bool:
-        """Stops the arm, unless a fault has, and retracts the whiskers; returns whether the arm rests."""
+        """Stops the arm, unless a fault has; returns whether it rests."""
         if self.arm.fault is None:
             self.arm.halt()
-        self.driver.rest()
         began = stood = now = time.monotonic()
         while now - stood < REST_TIME and now - began < MAX_REST_TIME:
             time.sleep(TICK)
@@ -185,4 +173,46 @@ class Rig(HeadRig):
         if kind is KeyboardInterrupt:  # second interrupt: stop by the dashboard server at once
             dashboard.stop_program(self.config.arm.host)
         self.arm.close()
+
+
+class Rig(ArmRig, HeadRig):
+    """Arm and whisker head of a session; a context manager that leaves both at rest.
+
+    Attributes:
+        head, driver: the head and its commands.
+    """
+
+    def __init__(self, config: LiveConfig, head: HeadConfig, stopped: Callable[[], bool]) -> None:
+        ArmRig.__init__(self, config, stopped)
+        self.shape = ur10_head(head)
+        shape, link = self.shape, config.head
+
+        def stop(whisker: int) -> None:
+            self.arm.fail(SessionOutcome.CONTACT, f"whisker {whisker} is bent beyond the overload limit")
+
+        reader = HeadReader(
+            lambda: open_bridge(link.address), len(shape.length), link, alive=shape.alive, on_overload=stop
+        )
+        self.driver = HeadDriver(reader, self.shape)
+        HeadRig.__init__(self, config, reader, stopped)
+
+    def poll(self) -> None:
+        """Reads the data of both devices; see `HeadRig`."""
+        for frames, arrival in self.stream.take():
+            if self.recorder is not None:
+                self.recorder.add_frames(frames, arrival - self.epoch)
+        self._take_states()
+        if self.arm.fault is None and self.stream.fault is not None:
+            raise SessionFault(self.stream.fault)
+        self._check()
+
+    def rest(self) -> bool:
+        """Stops the arm, unless a fault has, and retracts the whiskers; returns whether the arm rests."""
+        if self.arm.fault is None:
+            self.arm.halt()
+        self.driver.rest()
+        return super().rest()
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        super().__exit__(kind, *error)
         self.head.close()

@@ -167,7 +167,7 @@ class HeadRig(PolledRig):
     """
 
     def __init__(self, config: LiveConfig, head: HeadReader, stopped: Callable[[], bool]) -> None:
-        super().__init__(config, stopped)
+        PolledRig.__init__(self, config, stopped)
         self.head, self.stream = head, _HeadStream(head)
 
     def await_samples(self, whose: str) -> None:

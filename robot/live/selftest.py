@@ -21,7 +21,7 @@ from robot.drivers.ur10.safety import check_controller
 from robot.live.arm_route import check_targets, plan_path
 from robot.live.create_rig import CreateRig
 from robot.live.live_config import LiveConfig
-from robot.live.live_rig import Rig
+from robot.live.live_rig import ArmRig, Rig
 from robot.live.polling import HeadRig
 from robot.live.topics_rig import TopicsRig, require_topics
 from robot.recordings.recording_config import RecordingConfig
@@ -66,6 +66,10 @@ def check_session(
     path = plan_path(config, ur10_head(head))
     check_targets(config, path)
     yield f"route: {path.duration:.0f} s, every target is within the arm's limits"
+    if config.arm.touch == "force":
+        with ArmRig(config, lambda: False) as arm:
+            yield from find_devices(arm)
+        return
     with Rig(config, head, lambda: False) as rig:
         yield from find_devices(rig)
         yield _check_stream(rig)
@@ -88,7 +92,7 @@ def check_disk(config: LiveConfig, directory: Path) -> str:
     return f"disk: {free / 1e9:.0f} GB free"
 
 
-def find_devices(rig: Rig | CreateRig) -> Iterator[str]:
+def find_devices(rig: ArmRig | CreateRig) -> Iterator[str]:
     """Starts the stream of the whiskers and finds the robot; yields a line of text for each device.
 
     It asks the arm's controller for its status, which starts no program on it, or opens the Create's port
@@ -108,11 +112,14 @@ def find_devices(rig: Rig | CreateRig) -> Iterator[str]:
             raise InputError("live.create.plan.behaviour", str(error), "", cure) from None
         open_port(rig.create.port, MODELS[rig.create.model].baud).close()
         yield f"Create: port {rig.create.port} can be opened"
-    rig.head.start()
-    identity = rig.head.identity
-    assert identity is not None
-    yield f"head: {identity.name} {identity.version}, {identity.whiskers} whiskers at {identity.rate:g} Hz"
+    if isinstance(rig, HeadRig):
+        rig.head.start()
+        identity = rig.head.identity
+        assert identity is not None
+        sampled = f"{identity.whiskers} whiskers at {identity.rate:g} Hz"
+        yield f"head: {identity.name} {identity.version}, {sampled}"
     if isinstance(rig, CreateRig):
+        assert identity is not None
         wanted = rig.create.plan.whiskers.rate
         if abs(identity.rate - wanted) > 1e-6 * wanted:
             found, key = f"{identity.rate:g} samples per second", "live.create.plan.whiskers.rate"
@@ -122,7 +129,7 @@ def find_devices(rig: Rig | CreateRig) -> Iterator[str]:
         yield f"arm: {rig.config.arm.host}, PolyScope {version}, ready to start"
 
 
-def start_and_check(rig: Rig | CreateRig) -> Iterator[str]:
+def start_and_check(rig: ArmRig | CreateRig) -> Iterator[str]:
     """Starts the robot, a Create in safe mode and at rest, and checks the streams of the devices; yields a
     line of text for each passed check.
 
@@ -143,6 +150,8 @@ def start_and_check(rig: Rig | CreateRig) -> Iterator[str]:
     else:
         rig.arm.start()
         yield f"arm: {rig.config.arm.host}, admitted, states at {rig.config.arm.hz} Hz"
+    if not isinstance(rig, HeadRig):
+        return
     clocks = _check_stream(rig)
     if isinstance(rig, CreateRig):
         yield _check_whiskers(rig)

@@ -42,6 +42,8 @@ FIRST = 10.0
 """Time within which a topic must send its first message, s."""
 LONGEST_WAIT = 0.05
 """Time after which what is missing is looked at, if no message comes, s."""
+HELD = 1.0
+"""Time between two such looks above which this process itself was late, s."""
 FEW = 20
 """Messages of a topic that may be unusable, however few there are."""
 
@@ -110,6 +112,7 @@ class TopicsRig(PolledRig):
         self._transforms = list[Received]()  # before the session
         self._heard = dict[str, float]()  # time of the newest message by topic, s
         self._lost: float | None = None
+        self._looked = time.monotonic()  # time of the last look at what is missing
         self._ages = dict[str, float]()  # of the newest stamp at its arrival, by topic, s
         self.client.want(self._wanted)
 
@@ -209,7 +212,7 @@ class TopicsRig(PolledRig):
         self.steps = self._new_steps()
         self.steps.shape, self.steps.whiskers = shape
         now = time.monotonic()
-        self.epoch, self._heard = now, dict.fromkeys(self.steps.topics, now)
+        self.epoch, self._looked, self._heard = now, now, dict.fromkeys(self.steps.topics, now)
         self.began = time.process_time(), now
         self.messages.counts.clear()
         self.events.clear()
@@ -267,6 +270,10 @@ class TopicsRig(PolledRig):
     def check_patience(self) -> None:
         """Raises the fault of a connection or a topic that has been silent for too long."""
         now, longest, source = time.monotonic(), self.topics.patience, self.topics.source
+        held, self._looked = now - self._looked, now
+        if held > HELD:  # this process stood still: the robot cannot be blamed for that time
+            self._heard = {topic: heard + held for topic, heard in self._heard.items()}
+            self._lost = None if self._lost is None else self._lost + held
         if self._lost is not None and now - self._lost > longest:
             detail = f"no connection to {source} for {longest:g} s"
             raise session_fault(SessionOutcome.CONNECTION_LOST, detail)

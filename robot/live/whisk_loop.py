@@ -13,7 +13,7 @@ from robot.drivers.head.decoder import Cut, assemble_cycle
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.safety import TargetRefused
 from robot.live.arm_route import ArmRoute
-from robot.live.live_rig import Rig
+from robot.live.live_rig import ArmRig, Rig
 from robot.live.polling import TICK, AsyncMapper, SessionFault, check_mapper, session_fault
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
@@ -77,7 +77,7 @@ def run_whisk_loop(
         while rig.stream.streaming and rig.stream.restarts == life:
             rig.poll()
             check_mapper(mapper)
-            arrived = arrived or _advance(rig, route)
+            arrived = arrived or advance_route(rig, route)
             handed = _hand_on(rig, sequence, number, mapper)
             if handed is None:
                 time.sleep(TICK)
@@ -92,9 +92,30 @@ def run_whisk_loop(
             route.resend_last()
 
 
-def follow_route(rig: Rig, route: ArmRoute) -> None:
+def advance_route(rig: ArmRig, route: ArmRoute) -> bool:
+    """Whether the arm has arrived at the end of the route; at a target, the next one is sent.
+
+    Raises:
+        robot.live.polling.SessionFault: the arm has a fault, or the target is invalid.
+    """
+    try:
+        return route.advance(rig.arm)
+    except TargetRefused as error:
+        raise refusal(rig, error) from error
+
+
+def refusal(rig: ArmRig, error: TargetRefused) -> SessionFault:
+    """What ends a session whose arm refuses a target."""
+    return (
+        session_fault(SessionOutcome.OUT_OF_BOX, str(error))
+        if rig.arm.fault is None
+        else SessionFault(rig.arm.fault)
+    )
+
+
+def follow_route(rig: ArmRig, route: ArmRoute) -> None:
     """Moves along a route without whisks; the arm limits the time of each move by its plan."""
-    rig.wait_until(lambda: _advance(rig, route), float("inf"), SessionOutcome.NOT_ARRIVED, "the route")
+    rig.wait_until(lambda: advance_route(rig, route), float("inf"), SessionOutcome.NOT_ARRIVED, "the route")
 
 
 def _next_sequence(rig: Rig, number: int) -> _WhiskSequence:
@@ -166,16 +187,6 @@ def _hand_on(rig: Rig, sequence: _WhiskSequence, number: int, mapper: AsyncMappe
     mapper.offer(Sample(stamp, assemble_cycle(frames, cut), truth))
     missing = sequence.samples - len(frames.sequence)
     return WhiskReport(time.monotonic() - due, cut.seen, missing, truth)
-
-
-def _advance(rig: Rig, route: ArmRoute) -> bool:
-    """Whether the arm has arrived at the end of the route; at a target, the next one is sent."""
-    try:
-        return route.advance(rig.arm)
-    except TargetRefused as error:  # the arm has a fault, or the target is invalid
-        if rig.arm.fault is not None:
-            raise SessionFault(rig.arm.fault) from error
-        raise session_fault(SessionOutcome.OUT_OF_BOX, str(error)) from error
 
 
 def _has_arrived(rig: Rig, last: int) -> bool:

@@ -113,6 +113,25 @@ def tree_maze(columns: int, rows: int, random: np.random.Generator) -> Maze:
     return maze
 
 
+def table_maze(columns: int, rows: int, share: float, random: np.random.Generator) -> Maze:
+    """A table with a rim: about this share of the cells, but not the first, are objects, closed on all sides;
+    the others are open, and every one of them can be reached."""
+    maze = random_maze(columns, rows, [], 0.0, random)
+    cells = [(x, y) for y in range(rows) for x in range(columns)]
+    free = set(cells)
+    for number in random.permutation(len(cells) - 1) + 1:
+        if len(cells) - len(free) >= share * len(cells):
+            break
+        rest, reached = free - {cells[number]}, [(0, 0)]
+        for cell in reached:
+            reached += [b for b in maze.around(cell) if b in rest and b not in reached]
+        if len(reached) == len(rest):
+            free = rest
+            x, y = cells[number]
+            maze.across[y : y + 2, x] = maze.along[y, x : x + 2] = True
+    return maze
+
+
 def random_loop(columns: int, rows: int, length: int, random: np.random.Generator) -> list[Cell]:
     """A closed counter-clockwise path of this many different cells.
 

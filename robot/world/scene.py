@@ -29,6 +29,7 @@ from robot.world.maze import (
     random_loop,
     random_maze,
     read_maze,
+    table_maze,
     tree_maze,
     wall_boxes,
 )
@@ -145,11 +146,12 @@ class MazeConfig(Settings):
     """Cells from south to north."""
     loop: Annotated[int, Field(ge=1, le=4096)] = 20
     """Length of the open loop for circuits, cells."""
-    kind: Literal["loop", "tree"] = "loop"
+    kind: Literal["loop", "tree", "table"] = "loop"
     """`loop`: an open loop, and each other wall with the probability `share`; `tree`: one way between each
-    two cells, no loops, to explore."""
+    two cells, no loops; `table`: no walls but the rim's, and objects, each of one cell. The last two are to
+    explore."""
     share: Annotated[float, Field(ge=0, le=1)] = 0.6
-    """Probability of each wall between cells outside the loop."""
+    """Probability of each wall between cells outside the loop, or share of the cells that are objects."""
     file: File | None = None
     """A maze file to use instead: posts `o` or `+`, walls `---` and `|`."""
     heights: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (WALL_HEIGHT,)
@@ -323,9 +325,9 @@ def make_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, li
             expected = "the cells of a loop in the maze"
             raise InputError("simulation.path.loop", "circuits without a loop", expected, cure)
     else:
-        if config.kind == "tree" and (path.circuits or loop):
+        if config.kind != "loop" and (path.circuits or loop):
             cure = "explore, or use `simulation.maze.kind: loop`"
-            raise InputError("simulation.path", "circuits in a maze without loops", "an exploration", cure)
+            raise InputError("simulation.path", "circuits in a maze without a loop", "an exploration", cure)
         if config.kind == "loop" and not loop:
             loop = random_loop(columns, rows, config.loop, stream(seed, "maze.loop"))
         maze = _draw_walls(config, columns, rows, loop, stream(seed, "maze.walls"))
@@ -337,6 +339,8 @@ def _draw_walls(
 ) -> Maze:
     if config.kind == "tree":
         return tree_maze(columns, rows, random)
+    if config.kind == "table":
+        return table_maze(columns, rows, config.share, random)
     return random_maze(columns, rows, loop, config.share, random)
 
 

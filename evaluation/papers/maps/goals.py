@@ -191,7 +191,7 @@ class ClosedLoop:
         # Localises a robot that stands where a map ended, in that map.
         saved = read_map(stored.path)
         self._slam = Slam(localising(saved.config, saved, "here"), saved.source)
-        self._frontend, self._image = Frontend(config.touch), config.touch.image
+        self._frontend = Frontend(config.touch)
         self._reckoned = self._end = stored.arrays.truth[-1]
         self._arm = VirtualArm(self._live, self.walls(), self._end)
         self._cell = config.pose_cells.cell_size
@@ -199,7 +199,7 @@ class ClosedLoop:
         assert isinstance(localiser, Localiser)
         finished = localiser.place.map
         self._route: GoalRoute | None = None
-        self._contacts = contact_map(finished, self._image, self._head)
+        self._contacts = contact_map(finished, config.touch)
         self.experiences: networkx.DiGraph = finished.graph()
 
     @property
@@ -292,7 +292,7 @@ class ClosedLoop:
         motion = sample.reading.odometry
         self._reckoned = compose(self._reckoned, np.array([motion.dx, motion.dy, motion.dtheta]))
         pose = None if estimate.lost else estimate.pose
-        points = felt_points(seen, self._image, self._head)
+        points = felt_points(seen, self._frontend.config)
         return pose, points, sample.truth, self.pose
 
 

@@ -60,6 +60,7 @@ EXPLORATION, _LONG = {"path": {"explore": 1500}}, MAIN | {"path": {"explore": 50
 _OPEN_ARENA, _TREE = (MAIN | EXPLORATION | {"maze": maze} for maze in ({"share": 0.08}, {"kind": "tree"}))
 NOISE = OdometryConfig()
 _NOISE_X_2 = {"length": 2 * NOISE.length, "heading": 2 * NOISE.heading}
+_POKES, _TABLE = MAIN | {"touch": "force"}, {"maze": {"kind": "table", "share": 0.2}}
 _OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
@@ -121,6 +122,11 @@ ROWS = {
         MAIN | {"mechanics": {"baseline": HALL_BASELINE.model_dump()}},
     ),
     "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, _CARRIED),
+    "pokes": TouchRow("pokes of an arm without a head", _POKES),
+    "pokes on a table": TouchRow(
+        "pokes, a table with objects, free exploration", _POKES | EXPLORATION | _TABLE
+    ),
+    "control: shuffled pokes": TouchRow("control: shuffled pokes", _POKES),
     "control: shuffled": TouchRow("control: shuffled images", MAIN),
     "control: no image": TouchRow("control: no images", MAIN),
     "control: other maze": TouchRow("control: later laps in another maze", MAIN | {"later_maze": CHANGE}),
@@ -216,9 +222,9 @@ def run_and_measure(
         of each.
     """
     with open_observations(task_config(task)) as (config, source):
-        kidnaps = np.flatnonzero(source.source.kidnapped).tolist()  # type: ignore[attr-defined]
+        kidnaps = np.flatnonzero(getattr(source, "source", source).kidnapped).tolist()
         log = load_into_memory(source)
-    if task.row == "control: shuffled":
+    if task.row.startswith("control: shuffled"):
         order = np.random.default_rng(task.seed).permutation(len(log.views))
         log = replace(log, views=log.views[order].copy())
     if task.row == "control: no image":

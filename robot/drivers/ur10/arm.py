@@ -31,6 +31,7 @@ from robot.drivers.ur10 import dashboard, safety
 from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.safety import Finding, Move, StartupRefused, TargetRefused
 from robot.drivers.ur10.shared_state import SharedState
+from tactile.pokes import PokeConfig
 
 __all__ = ["Arm", "StartupRefused", "TargetRefused"]
 
@@ -130,7 +131,8 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
     Attributes:
         fault: the first reason to stop, or None. process: the RTDE process, or None. ready: whether it has
             measured the force at rest. refused: the failed connection, or None. pending: the last move.
-            armed: whether findings become faults. lock: for a check with a subsequent command.
+            touched: [6] tool pose at which the last poke met something, or None. armed: whether findings
+            become faults. lock: for a check with a subsequent command.
     """
 
     def __init__(self, config: ArmConfig) -> None:
@@ -139,6 +141,7 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
         self.process: _ArmProcess | None = None
         self.pending: PendingMove | None = None
         self.refused: StartupRefused | None = None
+        self.touched: np.ndarray | None = None
         self.fault: Fault | None = None
         self.ready = self.armed = False
         self._started = (0, 0)  # number of a move; newest operation before it
@@ -224,14 +227,28 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
         Raises:
             TargetRefused: the target is invalid, or the arm is not armed or has a fault.
         """
+        return self._start("move", tcp, speed)
+
+    def poke(self, tcp: Any, pokes: PokeConfig, threshold: float) -> Move:
+        """Starts a move of a resting tool that ends at a contact (`touched`), or at the pose [6] (`arrived`).
+
+        Args:
+            pokes: speed and windows. threshold: rise of the force that counts as a contact, N.
+
+        Raises:
+            TargetRefused: as `move`.
+        """
+        return self._start("poke", tcp, pokes.speed, pokes=pokes.model_dump(), threshold=threshold)
+
+    def _start(self, do: str, tcp: Any, speed: float | None, **more: Any) -> Move:
         with self.lock:  # a fault between check and command would not revoke it
             state = self.latest()
             if self.fault is not None or not self.armed or state is None:
                 raise TargetRefused(f"the arm does not move: {self.fault or 'it is not armed'}")
             move = safety.plan_move(self.config, tcp, state["tcp"], speed)
             deadline = time.monotonic() + move.most + self.config.patience
-            self._elsewhere = None
-            self.pending = self._order("move", move.target, move.speed), move, deadline
+            self._elsewhere = self.touched = None
+            self.pending = self._order(do, move.target, move.speed, **more), move, deadline
         return move
 
     def arrived(self) -> bool:
@@ -292,16 +309,20 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
         lateness = LatenessMeter(TICK, time.monotonic())
         while not self._closing.wait(TICK):
             now = time.monotonic()
-            self.shared.control["heartbeat"] = now
             self._late = lateness.turn(now)
-            with self.lock:
-                if self.process is not None:
-                    self._read_reports(self.process)
-                if self.process is not None and self.armed and self.fault is None:
-                    finding = self.process.exit_finding() or self._check_lateness(now)
-                    if finding is not None:
-                        self.fail(*finding)
-                self._follow_up(now)
+            self.supervise(now)
+
+    def supervise(self, now: float) -> None:
+        """Takes the reports of the process at a time (s, host), and acts on findings; its thread calls it."""
+        self.shared.control["heartbeat"] = now
+        with self.lock:
+            if self.process is not None:
+                self._read_reports(self.process)
+            if self.process is not None and self.armed and self.fault is None:
+                finding = self.process.exit_finding() or self._check_lateness(now)
+                if finding is not None:
+                    self.fail(*finding)
+            self._follow_up(now)
 
     def _read_reports(self, process: _ArmProcess) -> None:
         """Reads the reports of the process."""
@@ -316,6 +337,9 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
                 self.refused = StartupRefused(refusal, "", cure)
             elif report["say"] == "moving":
                 self._started = report["number"], report["operation"]
+            elif report["say"] == "touched":
+                if self.pending is not None and self.pending[0] == report["number"]:
+                    self.touched, self.pending = np.array(report["tcp"]), None
             elif report["say"] == "fault":
                 outcome, detail = SessionOutcome[report["outcome"]], report["detail"]
                 if self.armed:
@@ -378,10 +402,12 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
         """Stops by the dashboard server, in a separate thread, so that the heartbeat never blocks."""
         threading.Thread(target=dashboard.stop_program, args=(self.config.host,), daemon=True).start()
 
-    def _order(self, do: str, target: np.ndarray, speed: float) -> int:
+    def _order(self, do: str, target: np.ndarray, speed: float, **more: Any) -> int:
         """Sends a command that the next stop revokes; returns its number."""
         self._number += 1
         stops, place = int(self.shared.control["stops"]), target.tolist()
         if self.process is not None:
-            self.process.send(do=do, number=self._number, target=place, speed=float(speed), stops=stops)
+            self.process.send(
+                do=do, number=self._number, target=place, speed=float(speed), stops=stops, **more
+            )
         return self._number

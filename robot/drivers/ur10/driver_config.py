@@ -113,6 +113,8 @@ class ArmConfig(Settings):
     """Address of the controller; its ports are fixed. The default is the emulator's."""
     hz: Literal[125, 500] = 125
     """Rate of the state stream, Hz: 125 of a CB3, 500 of an e-Series (which supports 125 too)."""
+    touch: Literal["head", "force"] = "head"
+    """What the arm feels with: a whisker head, or, without one, its tool by pokes (`touch.pokes`)."""
     placing: BaseTransformConfig = BaseTransformConfig()
     """Pose of the map in the base frame."""
     box: BoxConfig = BoxConfig()

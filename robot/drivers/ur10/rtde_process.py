@@ -34,6 +34,7 @@ from robot.drivers.ur10.driver_config import ArmConfig
 from robot.drivers.ur10.safety import Finding, TargetRefused, check_state
 from robot.drivers.ur10.shared_state import ARM_STATE, SharedState
 from tactile.base.errors import InputError
+from tactile.pokes import PokeConfig, force_rise, is_loaded
 
 MAX_MISSING_STATES = 3  # state periods without a state before an interruption is certain
 SCRIPT_UNUSABLE = safety.SAFETY_STOPS | {SessionOutcome.ARM_GONE, SessionOutcome.HOST_LATE}
@@ -44,8 +45,9 @@ class ArmCommand(NamedTuple):
     """A command from the session.
 
     Attributes:
-        do: `move`, `retreat` or `end`. number: of the command. target: [6] tool pose. speed: m/s, as sent to
-            the controller. stops: number of stops requested before; a later stop revokes the command.
+        do: `move`, `poke`, `retreat` or `end`. number: of the command. target: [6] tool pose. speed: m/s, as
+            sent to the controller. stops: number of stops requested before; a later stop revokes the command.
+            pokes: settings of a poke (`tactile.pokes.PokeConfig`). threshold: of its rise, N.
     """
 
     do: str
@@ -53,6 +55,24 @@ class ArmCommand(NamedTuple):
     target: tuple[float, ...] = ()
     speed: float = 0.0
     stops: int = 0
+    pokes: dict[str, Any] | None = None
+    threshold: float = 0.0
+
+
+class _Poke(NamedTuple):
+    """A poke in progress.
+
+    Attributes:
+        number: of the command. along: [3] its direction. first: counter of its first state. longest: number
+            of its newest states that are looked at. config, threshold: see `ArmCommand`.
+    """
+
+    number: int
+    along: np.ndarray
+    first: int
+    longest: int
+    config: PokeConfig
+    threshold: float
 
 
 class CommandThread:
@@ -71,6 +91,7 @@ class CommandThread:
         self.script_unusable = False
         self.leaving = False
         self._retreating = False
+        self._poke: _Poke | None = None
         self._watch = safety.NO_STATE
         self._rest = np.zeros(6)
         self._force_limit = math.inf  # N; contacts are detected once the force at rest is known
@@ -92,6 +113,18 @@ class CommandThread:
         self._watch, finding = check_state(self.config, self._watch, state, self._rest, self._force_limit)
         if finding is not None:
             self.hold(finding)
+        elif self._poke is not None:
+            self._feel(self._poke, state)
+
+    def _feel(self, poke: _Poke, state: np.ndarray) -> None:
+        """Stops a poke at a contact, seen from a new state (ARM_STATE)."""
+        states = self.shared.since(max(poke.first, self.shared.newest - poke.longest) - 1)
+        push = -states["force"][:, :3] @ poke.along
+        rise = force_rise(poke.config, push, self.config.hz)[-1]
+        if rise > poke.threshold or is_loaded(push, self.config.force_limit)[-1]:
+            self._poke = None
+            self.stop()
+            self.report(say="touched", number=poke.number, tcp=state["tcp"].tolist())
 
     def hold(self, finding: Finding) -> None:
         """Stops and refuses further moves, unless an earlier finding did. Stops a retreat in any case."""
@@ -101,7 +134,7 @@ class CommandThread:
         if self.held is None:
             self.held = finding
             self.report(say="fault", outcome=finding.outcome.name, detail=finding.detail)
-        self._retreating = False
+        self._retreating, self._poke = False, None
         self.stop()
 
     def stop(self) -> None:
@@ -180,8 +213,15 @@ class CommandThread:
             self._retreating = True
         newest = self.shared.latest()
         assert newest is not None
+        self._poke = self._begin_poke(order, target[:3] - here["tcp"][:3]) if order.do == "poke" else None
         self.report(say="moving", number=order.number, operation=int(newest["operation"]))
         self.control.moveL(target.tolist(), order.speed, self.config.acceleration, True)
+
+    def _begin_poke(self, order: ArmCommand, way: np.ndarray) -> _Poke:
+        config = PokeConfig.model_validate(order.pokes)
+        longest = round(config.before[1] * self.config.hz) + 1
+        along = way / max(float(np.linalg.norm(way)), safety.MOVED_ON)
+        return _Poke(order.number, along, self.shared.newest, longest, config, order.threshold)
 
     def _revoked(self, order: ArmCommand) -> bool:
         stopped = order.stops != int(self.shared.control["stops"]) or self._requested_stops() != self._stopped

@@ -100,7 +100,11 @@ class SharedState:
 
     def latest(self) -> np.ndarray | None:
         """The newest state (ARM_STATE, one); None before the first."""
-        states = self.since(self.newest - 1)
+        newest = self.newest
+        state = self._ring[newest % SLOTS].copy()
+        if state["counter"] == newest > 0 and self._ring["counter"][newest % SLOTS] == newest:
+            return state
+        states = self.since(newest - 1)  # it was overwritten meanwhile
         return states[-1] if len(states) else None
 
     def close(self) -> None:

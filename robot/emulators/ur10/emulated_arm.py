@@ -13,7 +13,9 @@ from collections import deque
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from robot.emulators.ur10.emulator_config import UrEmulatorConfig
+import numpy as np
+
+from robot.emulators.ur10.emulator_config import PokedWallsConfig, UrEmulatorConfig
 from robot.emulators.ur10.kinematics import (
     UR10,
     UR10E,
@@ -24,6 +26,8 @@ from robot.emulators.ur10.kinematics import (
     rotation_between,
     vector6,
 )
+from robot.world.contact_force import force_error, wall_distance
+from tactile.base.random_streams import stream
 
 ZERO: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 NEAR: Vector6 = (0.0, -1.6, -1.6, -1.6, 1.57, 0.0)  # posture at the start, rad: elbow up, tool down
@@ -148,6 +152,26 @@ def parse_moves(text: str) -> list[MoveL]:
     return moves
 
 
+class _PokedWalls:
+    """The walls of a maze, and the errors of the measured force."""
+
+    def __init__(self, config: PokedWallsConfig) -> None:
+        self._config, self._boxes = config, np.array(config.boxes, np.float64).reshape(-1, 4)
+        self._random = stream(config.seed, "emulator.force")
+
+    def push(self, tcp: Vector6) -> tuple[float, list[float]]:
+        """Depth of a tool (pose [6]) in the walls, m, and the force that the arm measures [3], N."""
+        config, depth, force = self._config, 0.0, np.zeros(3)
+        pose, lift = config.placing.pose_from_tcp(np.array(tcp))
+        if len(self._boxes) and lift < config.top:
+            gap, outwards = wall_distance(self._boxes, pose[:2])
+            depth, turn = max(0.0, config.radius - float(gap)), np.radians(config.placing.yaw_deg)
+            c, s = np.cos(turn), np.sin(turn)
+            force[:2] = config.force.stiffness * depth * (np.array([[c, -s], [s, c]]) @ outwards)
+        noise = config.force.noise * self._random.standard_normal(3)
+        return depth, (force + force_error(config.force, pose) + noise).tolist()
+
+
 class EmulatedArm:
     """State of the emulated arm.
 
@@ -160,6 +184,7 @@ class EmulatedArm:
         self._geometry = UR10 if config.version[0] < 5 else UR10E
         self._tool = self._tool_back = ZERO  # pose of the tool in the flange, and its inverse
         self.walls = list(config.walls)
+        self._poked = None if config.poked is None else _PokedWalls(config.poked)
         self.turn_ratio = config.turn_ratio
         self.scale = 1.0
         self.force: Vector6 = ZERO
@@ -270,5 +295,8 @@ class EmulatedArm:
         force = [0.0, 0.0, 0.0]
         for wall, depth in zip(self.walls, depths, strict=True):
             force["xyz".index(wall.axis)] -= wall.solid * wall.stiffness * depth
+        if self._poked is not None:
+            depth, felt = self._poked.push(self.state.tcp)
+            depths, force = [*depths, depth], [sum(pair) for pair in zip(force, felt, strict=True)]
         self.force = vector6([*force, 0.0, 0.0, 0.0])
         self.penetration_max = max([self.penetration_max, *depths])

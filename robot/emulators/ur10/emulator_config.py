@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 
+from robot.drivers.ur10.driver_config import BaseTransformConfig
 from robot.emulators.ur10.kinematics import Vector6
+from robot.world.contact_force import ContactForceConfig
 from tactile.base.settings import Settings
 
 SCRIPT_PORT = 30003  # fixed in the client library
@@ -30,6 +32,23 @@ class WallConfig(Settings):
         return max(0.0, self.solid * (tcp["xyz".index(self.axis)] - self.at))
 
 
+class PokedWallsConfig(Settings):
+    """Upright walls that the tool meets at working height, as boxes on the floor."""
+
+    boxes: tuple[tuple[float, float, float, float], ...]
+    """West, south, east and north of each in the map, m."""
+    placing: BaseTransformConfig = BaseTransformConfig()
+    """Pose of the map in the base frame."""
+    radius: PositiveFloat = 0.005
+    """Radius of the tool, m."""
+    top: PositiveFloat = 0.03
+    """Height of the walls above the tool at working height, m."""
+    force: ContactForceConfig = ContactForceConfig()
+    """Stiffness of the walls, and errors of the measured force."""
+    seed: NonNegativeInt = 0
+    """Seed of the noise."""
+
+
 class UrEmulatorConfig(Settings):
     """An emulated UR controller with its arm."""
 
@@ -47,6 +66,8 @@ class UrEmulatorConfig(Settings):
     """Whether an e-Series reports remote control."""
     walls: tuple[WallConfig, ...] = ()
     """Obstacles."""
+    poked: PokedWallsConfig | None = None
+    """Walls of a maze, for an arm that pokes."""
     protective_force: PositiveFloat = 150.0
     """Force at the tool above which the controller makes a protective stop, N."""
     turn_ratio: PositiveFloat = 4.0

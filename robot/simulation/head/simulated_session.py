@@ -40,6 +40,7 @@ from robot.sources.in_memory import (
     wrap_headings,
 )
 from robot.sources.source import SimulationInfo, SourceInfo
+from robot.world.contact_force import ContactForceConfig
 from robot.world.maze import POSE_CELL_SIZE, maze_text
 from robot.world.scene import (
     KidnapConfig,
@@ -177,6 +178,10 @@ class SimulationConfig(Settings):
     """Model of the mechanics; `auto`: the cheapest one that gives the requested data."""
     raw: bool = False
     """Whether to give raw whisker samples, 2000 per second."""
+    touch: Literal["head", "force"] = "head"
+    """What feels: a whisker head, or, without one, the tool of the arm by pokes (`touch.pokes`)."""
+    force: ContactForceConfig = ContactForceConfig()
+    """Walls under pokes, and errors of the measured force."""
 
 
 Tier = Literal["kinematic", "quasistatic", "dynamic"]

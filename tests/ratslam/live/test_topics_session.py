@@ -340,9 +340,12 @@ def test_ten_minutes_lose_no_message_and_wait_for_none(loopback, tmp_path):
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, cwd=ROOT, **pipes) as robot:
         config = configured(tmp_path, robot.stdout.readline().strip())
-        process = start("live", config, "-o", tmp_path / "live")
+        process, told = start("live", config, "-o", tmp_path / "live"), list[str]()
+        # Ten minutes of progress are more than a pipe holds: who does not read them stops the session.
+        reader = threading.Thread(target=lambda: told.extend(process.stderr), daemon=True)
+        reader.start()
         while not (tmp_path / "live" / "session.mcap").exists():
-            assert process.poll() is None, process.communicate()
+            assert process.poll() is None, told
             time.sleep(0.05)
         time.sleep(0.5)
         robot.stdin.write("\n")
@@ -350,7 +353,8 @@ def test_ten_minutes_lose_no_message_and_wait_for_none(loopback, tmp_path):
         sent = [int(word) for word in robot.stdout.readline().split()]
         time.sleep(1.0)
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=PATIENCE)
+        process.wait(timeout=PATIENCE)
+        reader.join()
         robot.stdin.write("\n")
         robot.stdin.flush()
     assert process.returncode == 130, told

@@ -1,0 +1,164 @@
+"""The poke loop: the arm stops at even distances along its route and pokes once in each direction."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from robot.drivers.outcome import SessionOutcome
+from robot.drivers.ur10.driver_config import ArmConfig, tcp_heading
+from robot.drivers.ur10.safety import TargetRefused
+from robot.live.arm_route import ArmRoute
+from robot.live.live_rig import ArmRig
+from robot.live.polling import TICK, AsyncMapper, check_mapper
+from robot.live.whisk_loop import advance_route, refusal
+from robot.sources.source import Sample
+from tactile.base.se2 import between, wrap
+from tactile.pokes import TURN_LENGTH, PokeConfig, learn_threshold, poke_angles, poke_observation
+
+LONGEST_REST = 2.0
+"""Time at rest on a route that waits after which a ring is poked again, s."""
+
+
+class PokeReport(NamedTuple):
+    """Report on a ring of pokes.
+
+    Attributes:
+        pose: [3] by the arm. depth: [D] of the pokes, m. contact: [D] bool. took: duration, s.
+    """
+
+    pose: np.ndarray
+    depth: np.ndarray
+    contact: np.ndarray
+    took: float
+
+
+def learn_free_pokes(rig: ArmRig, pokes: PokeConfig) -> float:
+    """Pokes in free air, once in each direction; returns the threshold of the rise, N.
+
+    Raises:
+        InputError: the force is too uneven. robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
+    """
+    free, centre, arm = list[np.ndarray](), _here(rig), rig.config.arm
+    for target in poke_targets(arm, pokes, centre):
+        along = (target - centre)[:3] / np.linalg.norm((target - centre)[:3])
+        first = rig.arm.shared.newest
+        _poke(rig, target, pokes, float("inf"))
+        free.append(-rig.arm.states(first)["force"][:, :3] @ along)
+        _return(rig, centre, pokes)
+    return learn_threshold(pokes, free, arm.hz, arm.force_limit)
+
+
+def run_poke_loop(
+    rig: ArmRig,
+    route: ArmRoute,
+    mapper: AsyncMapper,
+    pokes: PokeConfig,
+    threshold: float,
+    tell: Callable[[PokeReport], None],
+) -> None:
+    """Pokes along the route and passes on every ring; ends with the ring where the arm arrives.
+
+    Args:
+        threshold: rise of the force that counts as a contact, N.
+
+    Raises:
+        robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
+    """
+    number, most, arrived = 0, rig.config.whisks, False
+    while number != most:
+        tell(_poke_ring(rig, mapper, pokes, threshold))
+        number += 1
+        if arrived:
+            return
+        arrived = _move_on(rig, route, mapper, pokes.every)
+
+
+def poke_targets(arm: ArmConfig, pokes: PokeConfig, centre: np.ndarray) -> list[np.ndarray]:
+    """Tool poses [6] at the ends of the pokes around a tool pose [6]; each ends at the box at the latest."""
+    low, high, found = np.array(arm.box.low[:2]), np.array(arm.box.high[:2]), []
+    for angle in poke_angles(pokes) + tcp_heading(centre):
+        along = np.array([np.cos(angle), np.sin(angle)])
+        with np.errstate(divide="ignore"):
+            room = np.where(along > 0, high - centre[:2], low - centre[:2]) / along
+        way = min(pokes.reach, float(room[along != 0].min()))
+        found.append(np.array([*(centre[:2] + max(way, 0.0) * along), *centre[2:]]))
+    return found
+
+
+def _here(rig: ArmRig) -> np.ndarray:
+    state = rig.arm.latest()
+    assert state is not None
+    return state["tcp"].copy()
+
+
+def _poke_ring(rig: ArmRig, mapper: AsyncMapper, pokes: PokeConfig, threshold: float) -> PokeReport:
+    """Pokes in each direction, records the ring and passes it on."""
+    rig.poll()
+    began, centre = time.monotonic(), _here(rig)
+    stamp = began - rig.epoch
+    odometry, truth = rig.odometer.step(stamp, began)
+    targets = poke_targets(rig.config.arm, pokes, centre)
+    depth, contact = np.full(len(targets), pokes.reach), np.zeros(len(targets), bool)
+    for k, target in enumerate(targets):
+        check_mapper(mapper)
+        touched = _poke(rig, target, pokes, threshold)
+        if touched is not None:
+            depth[k], contact[k] = np.linalg.norm((touched - centre)[:3]), True
+        _return(rig, centre, pokes)
+    sample = Sample(stamp, poke_observation(pokes, depth, contact, odometry), truth)
+    if rig.recorder is not None:
+        rig.recorder.add(sample)
+    mapper.offer(sample)
+    return PokeReport(truth, depth, contact, time.monotonic() - began)
+
+
+def _poke(rig: ArmRig, target: np.ndarray, pokes: PokeConfig, threshold: float) -> np.ndarray | None:
+    """Pokes towards a target [6]; returns the tool pose [6] at the contact, or None without one."""
+    try:
+        rig.arm.poke(target, pokes, threshold)
+    except TargetRefused as error:
+        raise refusal(rig, error) from error
+    _wait(rig, lambda: rig.arm.touched is not None or rig.arm.arrived())
+    return rig.arm.touched
+
+
+def _return(rig: ArmRig, centre: np.ndarray, pokes: PokeConfig) -> None:
+    """Moves the tool back to the centre [6] of its ring."""
+    _wait(rig, rig.arm.still)
+    try:
+        rig.arm.move(centre, min(pokes.retract, rig.config.arm.speed))
+    except TargetRefused as error:
+        raise refusal(rig, error) from error
+    _wait(rig, rig.arm.arrived)
+
+
+def _wait(rig: ArmRig, done: Callable[[], bool]) -> None:
+    """Polls until a condition is true; the arm limits the time of each move by its plan."""
+    rig.wait_until(done, float("inf"), SessionOutcome.NOT_ARRIVED, "a poke")
+
+
+def _move_on(rig: ArmRig, route: ArmRoute, mapper: AsyncMapper, every: float) -> bool:
+    """Moves along the route by `every` m, or until it rests; returns whether the arm is at its end."""
+    before, rested = rig.odometer.pose(time.monotonic()), time.monotonic()
+    while True:
+        rig.poll()
+        check_mapper(mapper)
+        now = time.monotonic()
+        if advance_route(rig, route):
+            return True
+        dx, dy, turn = between(before, rig.odometer.pose(now))
+        if np.hypot(dx, dy) + TURN_LENGTH * abs(wrap(turn)) >= every:
+            break
+        if not rig.arm.still() or mapper.behind() > 0:
+            rested = now
+        elif now - rested > LONGEST_REST:
+            break
+        time.sleep(TICK)
+    rig.arm.halt()
+    _wait(rig, rig.arm.still)
+    route.resend_last()
+    return False
