@@ -60,7 +60,8 @@ EXPLORATION, _LONG = {"path": {"explore": 1500}}, MAIN | {"path": {"explore": 50
 _OPEN_ARENA, _TREE = (MAIN | EXPLORATION | {"maze": maze} for maze in ({"share": 0.08}, {"kind": "tree"}))
 NOISE = OdometryConfig()
 _NOISE_X_2 = {"length": 2 * NOISE.length, "heading": 2 * NOISE.heading}
-_POKES, _TABLE = MAIN | {"touch": "force"}, {"maze": {"kind": "table", "share": 0.2}}
+_POKES = MAIN | {"touch": "force"}
+_TABLE = _POKES | EXPLORATION | {"maze": {"kind": "table", "share": 0.2}}
 _OPEN_LOOP = {"whisking": {"mode": "open"}}
 
 
@@ -123,9 +124,7 @@ ROWS = {
     ),
     "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, _CARRIED),
     "pokes": TouchRow("pokes of an arm without a head", _POKES),
-    "pokes on a table": TouchRow(
-        "pokes, a table with objects, free exploration", _POKES | EXPLORATION | _TABLE
-    ),
+    "pokes on a table": TouchRow("pokes, a table with objects, exploration", _TABLE),
     "control: shuffled pokes": TouchRow("control: shuffled pokes", _POKES),
     "control: shuffled": TouchRow("control: shuffled images", MAIN),
     "control: no image": TouchRow("control: no images", MAIN),
@@ -222,7 +221,7 @@ def run_and_measure(
         of each.
     """
     with open_observations(task_config(task)) as (config, source):
-        kidnaps = np.flatnonzero(getattr(source, "source", source).kidnapped).tolist()
+        kidnaps = np.flatnonzero(getattr(source, "source", source).kidnapped).tolist()  # type: ignore[union-attr]
         log = load_into_memory(source)
     if task.row.startswith("control: shuffled"):
         order = np.random.default_rng(task.seed).permutation(len(log.views))

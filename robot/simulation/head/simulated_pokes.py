@@ -104,7 +104,8 @@ class PokeSimulation(SimulatedSource):
 
     Attributes:
         time: [N] s, of the rings. truth: [N, 3]. odometry: [N, 4]. depth: [N, D] of the pokes, m. contact:
-            [N, D] bool. kidnapped: [N] bool, whether a kidnap precedes the ring. way: [N, D] to the wall, m; infinite without one. threshold: of the force's rise, N.
+            [N, D] bool. kidnapped: [N] bool, whether a kidnap precedes the ring. way: [N, D] to the wall, m;
+            infinite without one. threshold: of the force's rise, N.
 
     Raises:
         InputError: the configuration cannot be simulated; the error gives key and reason.
