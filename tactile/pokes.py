@@ -54,6 +54,11 @@ HIGHEST = 1 / 3
 """Largest threshold as a share of the arm's force limit: a poke stops there at the latest."""
 
 
+def ring_time(config: PokeConfig) -> float:
+    """Duration of a ring without contacts, s."""
+    return config.directions * config.reach * (1 / config.speed + 1 / config.retract)
+
+
 def poke_angles(config: PokeConfig) -> np.ndarray:
     """Directions [D] of the pokes in base_link, rad, counter-clockwise from ahead."""
     return 2 * np.pi * np.arange(config.directions) / config.directions

@@ -31,6 +31,7 @@ from robot.sources.source import SourceDescription, SourceInfo
 from robot.world.maze import POSE_CELL_SIZE
 from robot.world.scene import HeadPath, maze_info
 from tactile.calibration import Calibration, calibrate
+from tactile.pokes import ring_time
 from tactile.whisker_geometry import ur10_head
 from tactile.whisker_image import view_shape
 
@@ -295,8 +296,9 @@ class PokeSession(_ArmSession):
         return float(moved_length(path)[-1]) / self._config.touch.pokes.every + 1
 
     def _describe(self, info: SourceInfo) -> SourceDescription:
-        directions = self._config.touch.pokes.directions
-        return SourceDescription((1, directions, 1), directions, 0.0, info)
+        pokes = self._config.touch.pokes
+        info = info.model_copy(update={"interval": ring_time(pokes)})
+        return SourceDescription((1, pokes.directions, 1), pokes.directions, 0.0, info)
 
     def calibrate(self, log: Callable[[str], None]) -> None:
         """Pokes in free air above the start of the route."""

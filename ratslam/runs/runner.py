@@ -244,7 +244,7 @@ class Runner:
             time, poses = read_tum(self._directory.path / "odometry.tum")
             moved = between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
             motion = np.column_stack([moved, np.diff(time, prepend=time[:1])])
-            found += judge_motion(time, motion, self._source.name)
+            found += judge_motion(time, motion, self._source.name, self._source.info.interval)
         self._write_manifest(input=_input(found))
 
     def _write_manifest(self, **changed: Any) -> None:

@@ -166,15 +166,25 @@ class InputJudge:
 DEFAULT_JUDGE = InputJudge()
 
 
-def judge_motion(time: np.ndarray, motion: np.ndarray, where: str) -> list[str]:
+def limits_of(interval: float | None, limits: UnitLimits = DEFAULT_LIMITS) -> UnitLimits:
+    """The limits for a source whose steps take so long, s; None: as long as those of other robots."""
+    longest = max(limits.interval, 3 * (interval or 0.0))
+    return limits.model_copy(update={"interval": longest})
+
+
+def judge_motion(
+    time: np.ndarray, motion: np.ndarray, where: str, interval: float | None = None
+) -> list[str]:
     """Warnings about the odometry of a session that no recording was read for: live, simulated, a plug-in.
 
     Args:
-        time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s). where: names the session.
+        time: [N] s. motion: [N, 4] (dx m, dy m, dtheta rad, dt s). where: names the session. interval: usual
+            duration of a step, s, see `limits_of`.
     """
-    track = MotionTrack(time, np.ones(len(time), bool), motion)
-    found = [f"{where}, step {each.row or 0}: {each.found}; {each.cure}" for each in _judge_steps(track)]
-    return [*map(str, unit_errors(track, where)), *found]
+    track, limits = MotionTrack(time, np.ones(len(time), bool), motion), limits_of(interval)
+    steps = _judge_steps(track, limits)
+    found = [f"{where}, step {each.row or 0}: {each.found}; {each.cure}" for each in steps]
+    return [*map(str, unit_errors(track, where, limits)), *found]
 
 
 class _Finding(NamedTuple):

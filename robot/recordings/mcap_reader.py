@@ -13,6 +13,7 @@ import struct
 from array import array
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
 from zlib import crc32
@@ -26,7 +27,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from robot.drivers.head.decoder import Frames, FrameWindow, assemble_cycle
 from robot.recordings import cdr
 from robot.recordings.cdr import Event, Malformed, doubts_of
-from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack
+from robot.recordings.input_judge import DEFAULT_JUDGE, InputJudge, MotionTrack, limits_of
 from robot.recordings.sanity_checks import clock_errors, first_error, nonfinite_errors, view_errors
 from robot.sources.input_files import digest_of, raise_errors, readable, require_file
 from robot.sources.source import ClosedSource, Sample, Source, SourceDescription, SourceInfo, rate_of
@@ -392,6 +393,7 @@ class Recording(ClosedSource):
         dt = motion[:, 3]
         errors += first_error(dt < 0, place, lambda row: f"odometry has dt {dt[row]} s", "at least 0 s")
         track = MotionTrack(time, moved, motion, truth if has_truth.any() else None)
+        judge = replace(judge, limits=limits_of(self.info.interval, judge.limits))
         raise_errors(errors + judge.errors(track, place, str(self.path), in_order=not errors))
         return time[moved]
 

@@ -77,6 +77,8 @@ class SourceInfo(Settings):
     """Whether readings carry given place labels and never a view."""
     signed_views: bool = False
     """Whether views are signed departures from rest, in any unit, instead of values in 0..1."""
+    interval: PositiveFloat | None = None
+    """Duration of a step where it is longer than that of other robots, s, such as of a ring of pokes."""
     cell_size: PositiveFloat | None = None
     """Pose-cell side length that suits the data, m."""
     head: HeadConfig | None = None

@@ -2,6 +2,7 @@
 one thread without sockets. What the driver waits for passes at once."""
 
 from collections import deque
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -57,7 +58,7 @@ class VirtualArm(Arm):
     """An arm in virtual time: `sleep` moves it on.
 
     Attributes:
-        controller: the emulated one. now: s. pressed: largest force at the tool so far beside the errors, N.
+        controller: the emulated one. now: s. spoil: changes a state before it is published.
     """
 
     emulated = UrEmulatorConfig()
@@ -66,6 +67,7 @@ class VirtualArm(Arm):
         super().__init__(config)
         self.controller = EmulatedController(self.emulated)
         self.now = 1000.0
+        self.spoil: Callable[[np.ndarray], None] = lambda state: None
         self._control = _Control(self.controller)
         self._told = list[dict[str, Any]]()
         self.commands = CommandThread(
@@ -91,6 +93,7 @@ class VirtualArm(Arm):
         state["safety"] = SAFETY_BITS[self.controller.safety]
         state["operation"] = self._control.operation % 128
         state["progress"] = 0 if arm.busy else -1
+        self.spoil(state)
         self.shared.publish(state)
         self.commands.check_state(state)
         if not self.commands.script_unusable:

@@ -68,8 +68,11 @@ class Bench:
     def session(
         self, mapper: float | None = 0.0, order: dict[str, Any] | None = None, **settings: Any
     ) -> AbstractContextManager[Session]:
-        """A quick session with settings of the section `live`, started; see `SessionServer.session`."""
-        return self._server.session({"live": self.quick(**settings)}, mapper=mapper, **order or {})
+        """A quick session with settings of the section `live`, and a section `touch`, started; see
+        `SessionServer.session`."""
+        touch = {"touch": settings.pop("touch")} if "touch" in settings else {}
+        sections = {"live": self.quick(**settings)} | touch
+        return self._server.session(sections, mapper=mapper, **order or {})
 
     @contextmanager
     def in_motion(self, **settings: Any) -> Iterator[Session]:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10 import rtde_process
+from robot.emulators.ur10.emulator_config import WallConfig
 from robot.live import live_rig
 from robot.live.arm_route import arm_routes, plan_path, plan_scene
 from robot.live.live_config import LiveConfig
@@ -251,3 +252,44 @@ def test_the_error_of_the_force_has_its_amplitude():
     assert np.abs(error[:, :2]).max() == pytest.approx(2.0, rel=0.01)
     assert error[:, 2].mean() == pytest.approx(-0.2 * 9.81, abs=0.1)
     assert not is_loaded(error[:100, 0], 30.0).any()
+
+
+@pytest.mark.parametrize(
+    ("fault", "outcome"),
+    [
+        ("protective_stop", SessionOutcome.PROTECTIVE_STOP),
+        ("safeguard_stop", SessionOutcome.SAFEGUARD_STOP),
+        ("emergency_stop", SessionOutcome.EMERGENCY_STOP),
+        ("nan", SessionOutcome.ARM_MALFORMED),
+        ("freeze", SessionOutcome.CLOCK_JUMPED),
+        ("ik_fails", SessionOutcome.UNREACHABLE),
+        ("wall", SessionOutcome.CONTACT),
+    ],
+)
+def test_a_fault_of_the_arm_while_it_pokes_is_named(monkeypatch, fault, outcome):
+    rig, route, threshold, _ = session_of(monkeypatch, QUICK, "C", 20)
+    arm, reports = rig.arm, []
+
+    def strike():
+        controller, moving = arm.controller, np.linalg.norm(arm.latest()["speed"][:3]) > 0.01
+        if len(reports) != 1 or not moving or controller.targets:
+            return False
+        controller.targets.append({})  # once
+        if fault == "nan":
+            arm.spoil = lambda state: state["tcp"].fill(np.nan)
+        elif fault == "freeze":
+            arm.spoil = lambda state: state["robot"].fill(1.0)
+        elif fault == "ik_fails":
+            controller.ik_fails = True
+        elif fault == "wall":  # it is already deep inside
+            height = float(arm.latest()["tcp"][2])
+            controller.arm.walls.append(WallConfig(axis="z", at=height - 0.01))
+        else:
+            getattr(controller, fault)()
+        return False
+
+    monkeypatch.setattr(rig, "poll", lambda: (strike(), ArmRig.poll(rig)))
+    with rig, pytest.raises(SessionFault) as ended:
+        run_poke_loop(rig, route, _Offered(), QUICK, threshold, reports.append)
+    assert ended.value.fault.outcome is outcome
+    assert len(reports) == 1
