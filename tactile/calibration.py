@@ -433,7 +433,9 @@ def follow_baseline(
     """The baselines after the rest at the beginning of a cycle; whiskers with NaN samples keep theirs.
 
     At the beginning of a cycle a whisker is at rest, before its protraction touches anything, so these
-    samples show how far the baseline has drifted. A cycle without samples changes nothing.
+    samples show how far the baseline has drifted. A cycle without samples changes nothing. What moves most
+    whiskers at once is no contact but their surroundings, as the Earth's field does when the head turns: the
+    distance at which a whisker is away is then three times the median of all.
     """
     count = round(config.rest_time * calibration.rate)
     if not len(cycle.time) or not count:
@@ -441,7 +443,9 @@ def follow_baseline(
     rest = cycle.deflection[:count].mean(axis=0) - calibration.mean - baseline.offset
     known = calibration.alive & np.isfinite(rest).all(axis=-1)
     wandering = np.sqrt(1.0 + np.minimum(baseline.away, config.bent_cycles))
-    free = known & (np.abs(rest) <= config.free_sds * wandering[:, None] * calibration.sd).all(axis=-1)
+    away = np.abs(rest) / np.maximum(calibration.sd, np.finfo(float).tiny)
+    common = max(1.0, float(np.median(away[known])) / 2) if known.any() else 1.0
+    free = known & (away <= config.free_sds * wandering[:, None] * common).all(axis=-1)
     return RestBaseline(
         offset=baseline.offset + np.where(free[:, None], config.gain * rest, 0.0),
         away=np.where(known, np.where(free, 0, baseline.away + 1), baseline.away),

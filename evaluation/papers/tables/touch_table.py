@@ -41,6 +41,7 @@ from ratslam.runs.settings.run_config import RunConfig
 from robot.simulation.head.baseline import HALL_BASELINE
 from robot.simulation.head.odometry_errors import OdometryConfig
 from robot.sources.in_memory import InMemorySource, load_into_memory
+from tactile.contact_threshold import ContactConfig
 
 FIRST_MAZE = 31100
 _SUCCESS = 0.25
@@ -84,6 +85,12 @@ def _head(*radii: float) -> dict[str, Any]:
     return {"rings": [{"length": a, "radius": b, "height": c} for a, b, c in parts]}
 
 
+def _field(thresholds: float) -> dict[str, Any]:
+    """Sessions in a field of so many contact thresholds."""
+    field = thresholds * ContactConfig().contact_sds
+    return MAIN | {"raw": True, "mechanics": {"baseline": {"field": field}}}
+
+
 ROWS = {
     "main": TouchRow("main: ten circuits, 5 mm / 1.5 deg / 5 %", MAIN, sessions=40),
     "clean": TouchRow("clean: 2 mm / 0.5 deg"),
@@ -121,6 +128,11 @@ ROWS = {
     "drift": TouchRow(
         "main from raw samples with drift, colour and creep",
         MAIN | {"mechanics": {"baseline": HALL_BASELINE.model_dump()}},
+    ),
+    "field .5": TouchRow("main from raw samples, the Earth's field of half a contact threshold", _field(0.5)),
+    "field 2": TouchRow("the Earth's field of two contact thresholds", _field(2.0)),
+    "control: field 2": TouchRow(
+        "control: two thresholds, the calibration's baseline", _field(2.0), {"baseline": None}
     ),
     "kidnaps": TouchRow("8 kidnaps of 45 s, `may_be_carried`", KIDNAPS, {}, _CARRIED),
     "pokes": TouchRow("pokes of an arm without a head", _POKES),

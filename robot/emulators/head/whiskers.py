@@ -170,7 +170,8 @@ class Whiskers(SensorArray):
             else:
                 sweep = sweep_air(time, some)
             truth, self.balance = advance_balance(config, self.mechanics, drives.law, sweep, self.balance)
-            parts.append(sensor_readings(config, self.head, truth, sweep.noise, self.baseline))
+            turned = np.interp(done + np.arange(count), [0, size], pose[0, :, 2])[None]
+            parts.append(sensor_readings(config, self.head, truth, sweep.noise, self.baseline, turned))
             drives.sample = 0 if left is None else first + count
             done += count
         angle, deflection = (np.concatenate([part[k][0] for part in parts]) for k in range(2))

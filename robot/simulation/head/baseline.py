@@ -1,4 +1,5 @@
-"""Coloured noise, baseline drift and creep of deflections: what magnetic whiskers show beyond white noise.
+"""Coloured noise, baseline drift, creep and the Earth's field in deflections: what magnetic whiskers show
+beyond white noise.
 
 Each goes on from whisk to whisk, through the free record and the session after it, and draws from a random
 stream of its own; how the samples are cut into blocks makes no difference. The drives' feedback reads the
@@ -34,10 +35,15 @@ class BaselineConfig(Settings):
     creep_time: PositiveFloat = 0.6
     """Time in which it bends and relaxes to 1/e, s."""
 
+    field: NonNegativeFloat = 0.0
+    """Amplitude of the Earth's field in each deflection, in multiples of `mechanics.noise`: a cos + b sin of
+    the heading, in a phase of its own. Its horizontal part is 15 to 35 uT, and a Hall sensor's noise about 1
+    to 5 uT, so a sensor without a shield shows 3 to 35."""
+
     @property
     def is_on(self) -> bool:
-        """Whether there is colour, drift or creep."""
-        return bool(self.colour or self.drift or self.creep)
+        """Whether there is colour, drift, creep or a field."""
+        return bool(self.colour or self.drift or self.creep or self.field)
 
 
 HALL_BASELINE = BaselineConfig(colour=1.0, colour_time=0.005, drift=1.5, creep=0.03, creep_time=0.6)
@@ -68,6 +74,8 @@ class Baseline:
         self._gain = config.creep * (1 - self._relax)
         self._colour = self._keep * self._colours.standard_normal((1, whiskers, 2))
         self._drift, self._creep = np.zeros((1, whiskers, 2)), np.zeros((1, whiskers, 2))
+        self._field = noise * config.field
+        self._phase = 2 * np.pi * stream(seed, "field").random((whiskers, 2))
 
     def colour(self, white: np.ndarray) -> np.ndarray:
         """The noise of the next samples [N, T, W, 2], rad, of which white noise, rad, is a part."""
@@ -75,15 +83,18 @@ class Baseline:
         colour, self._colour = self._recur(self._keep, kicks, self._colour)
         return self._white * white + self._coloured * colour
 
-    def wander(self, deflection: np.ndarray) -> np.ndarray:
-        """Drift and creep of the next samples [N, T, W, 2], rad, for the deflections without them, rad.
+    def wander(self, deflection: np.ndarray, heading: np.ndarray | None = None) -> np.ndarray:
+        """Drift, creep and field of the next samples [N, T, W, 2], rad, for the deflections without them
+        and the headings [N, T] of the head (None: it does not turn), rad.
 
         The creep is that of a standard linear solid: it tends to its share of the deflection.
         """
         steps = self._step * self._steps.standard_normal(deflection.shape)
         drift, self._drift = self._recur(1.0, steps, self._drift)
         creep, self._creep = self._recur(self._relax, self._gain * deflection, self._creep)
-        return drift + creep
+        if heading is None or not self._field:
+            return drift + creep
+        return drift + creep + self._field * np.cos(heading[..., None, None] + self._phase)
 
     def _recur(self, keep: float, value: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The recursion y = value + keep * last y over the samples of [N, T, W, 2].

@@ -79,7 +79,8 @@ def simulate_cycles(
             sweep = sweep_air(time, noise)
         else:
             sweep = sweep_walls(surroundings, poses_at(path, begins[:, None] + knots), knots, time, noise)
-        samples = sensor_readings(config, head, tier(setup, sweep, threshold), noise, baseline)
+        truth, heading = tier(setup, sweep, threshold), poses_at(path, begins[:, None] + time)[..., 2]
+        samples = sensor_readings(config, head, truth, noise, baseline, heading)
         for begin, angle, deflection in zip(begins, *samples, strict=True):
             yield Cycle(begin + time, angle, deflection, NO_ODOMETRY)
 
@@ -116,16 +117,22 @@ def draw_noise(
 
 
 def sensor_readings(
-    config: StreamConfig, head: Head, truth: TrueSamples, noise: np.ndarray, baseline: Baseline | None
+    config: StreamConfig,
+    head: Head,
+    truth: TrueSamples,
+    noise: np.ndarray,
+    baseline: Baseline | None,
+    heading: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sensor readings for true values of a model: angles [N, T, W] and deflections [N, T, W, 2], rad.
 
     Args:
-        noise: [N, T, W, 3] rad. baseline: its drift and creep are added to the deflections.
+        noise: [N, T, W, 3] rad. baseline: its drift, creep and field are added to the deflections.
+            heading: [N, T] of the head, rad.
     """
     seen = np.stack([part.swapaxes(0, 1) for part in truth], axis=-1)
     if baseline is not None:
-        seen[..., 1:] += baseline.wander(seen[..., 1:])
+        seen[..., 1:] += baseline.wander(seen[..., 1:], heading)
     # A dead whisker sends zeros.
     seen = (seen + noise) * head.alive[:, None]
     return seen[..., 0], np.clip(seen[..., 1:], -config.full_scale, config.full_scale)
