@@ -327,7 +327,7 @@ def make_maze(config: MazeConfig, path: PathConfig, seed: int) -> tuple[Maze, li
     else:
         if config.kind != "loop" and (path.circuits or loop):
             cure = "explore, or use `simulation.maze.kind: loop`"
-            raise InputError("simulation.path", "circuits in a maze without a loop", "an exploration", cure)
+            raise InputError("simulation.path", "circuits in a maze without loops", "an exploration", cure)
         if config.kind == "loop" and not loop:
             loop = random_loop(columns, rows, config.loop, stream(seed, "maze.loop"))
         maze = _draw_walls(config, columns, rows, loop, stream(seed, "maze.walls"))
