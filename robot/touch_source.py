@@ -119,7 +119,7 @@ def open_touch_source(source: Source, config: TouchConfig) -> Source:
 def touch_config_of(info: SourceInfo, config: TouchConfig) -> TouchConfig:
     """The configuration with the whiskers of a source, see `head_config_of` and `report_config_of`."""
     heads = {"head": head_config_of(info, config.head), "reports": report_config_of(info, config.reports)}
-    return config.model_copy(update=heads)
+    return config.model_copy(update=heads | {"pokes": info.pokes or config.pokes})
 
 
 def head_config_of(info: SourceInfo, config: HeadConfig) -> HeadConfig:

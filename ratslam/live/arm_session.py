@@ -31,7 +31,6 @@ from robot.sources.source import SourceDescription, SourceInfo
 from robot.world.maze import POSE_CELL_SIZE
 from robot.world.scene import HeadPath, maze_info
 from tactile.calibration import Calibration, calibrate
-from tactile.pokes import ring_time
 from tactile.whisker_geometry import ur10_head
 from tactile.whisker_image import view_shape
 
@@ -297,7 +296,7 @@ class PokeSession(_ArmSession):
 
     def _describe(self, info: SourceInfo) -> SourceDescription:
         pokes = self._config.touch.pokes
-        info = info.model_copy(update={"interval": ring_time(pokes)})
+        info = info.model_copy(update={"pokes": pokes})
         return SourceDescription((1, pokes.directions, 1), pokes.directions, 0.0, info)
 
     def calibrate(self, log: Callable[[str], None]) -> None:

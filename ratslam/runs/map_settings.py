@@ -89,7 +89,8 @@ def _text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
-WHISKER_HEAD, FIXED_WHISKERS, OTHER_TOUCH = "whisker head", "fixed whiskers", "registered touch sensor"
+WHISKER_HEAD, FIXED_WHISKERS, POKES = "whisker head", "fixed whiskers", "pokes of an arm"
+OTHER_TOUCH = "registered touch sensor"
 VIEWS, LABELS = "camera or laser", "given place labels"
 UNITS = {True: "signed departures from rest, in the sensor's unit", False: "values in 0..1"}
 Difference = tuple[str, Any, Any]
@@ -149,6 +150,9 @@ class Sensor(NamedTuple):
             reports = touch.reports.model_dump(mode="json")
             geometry = {f"touch.reports.{name}": reports[name] for name in ("mounts", "length")}
             kind, made = FIXED_WHISKERS, {"touch.reports.walls": reports["walls"]}
+        elif info.pokes is not None:
+            pokes = info.pokes.model_dump(mode="json", include={"reach", "bins", "radius"})
+            kind, made = POKES, {f"touch.pokes.{name}": value for name, value in pokes.items()}
         elif source.whiskers:
             head = touch.head.model_dump(mode="json", exclude={"dead", "limit_deg"})
             geometry = {f"touch.head.{name}": value for name, value in head.items()}

@@ -166,15 +166,13 @@ class InputJudge:
 DEFAULT_JUDGE = InputJudge()
 
 
-def limits_of(interval: float | None, limits: UnitLimits = DEFAULT_LIMITS) -> UnitLimits:
-    """The limits for a source whose steps take so long, s; None: as long as those of other robots."""
-    longest = max(limits.interval, 3 * (interval or 0.0))
+def limits_of(interval: float, limits: UnitLimits = DEFAULT_LIMITS) -> UnitLimits:
+    """The limits for a source whose steps take so long, s; 0: as long as those of other robots."""
+    longest = max(limits.interval, 3 * interval)
     return limits.model_copy(update={"interval": longest})
 
 
-def judge_motion(
-    time: np.ndarray, motion: np.ndarray, where: str, interval: float | None = None
-) -> list[str]:
+def judge_motion(time: np.ndarray, motion: np.ndarray, where: str, interval: float = 0.0) -> list[str]:
     """Warnings about the odometry of a session that no recording was read for: live, simulated, a plug-in.
 
     Args:

@@ -21,6 +21,7 @@ from tactile.base.errors import InputError
 from tactile.base.plugins import Registry
 from tactile.base.settings import Settings
 from tactile.calibration import Calibration
+from tactile.pokes import PokeConfig, ring_time
 from tactile.whisker_geometry import HeadConfig
 
 
@@ -77,8 +78,8 @@ class SourceInfo(Settings):
     """Whether readings carry given place labels and never a view."""
     signed_views: bool = False
     """Whether views are signed departures from rest, in any unit, instead of values in 0..1."""
-    interval: PositiveFloat | None = None
-    """Duration of a step where it is longer than that of other robots, s, such as of a ring of pokes."""
+    pokes: PokeConfig | None = None
+    """Pokes of an arm without a whisker head."""
     cell_size: PositiveFloat | None = None
     """Pose-cell side length that suits the data, m."""
     head: HeadConfig | None = None
@@ -100,6 +101,11 @@ class SourceInfo(Settings):
     provenance: dict[str, Any] = Field(default_factory=dict)
     """Generating configuration under its key in a run configuration (`simulation`, `create_simulation`,
     `rat_simulation`, `live`), or `parameters` of a recording. Its reader validates it."""
+
+    @property
+    def interval(self) -> float:
+        """Usual duration of a step where it is longer than that of other robots, s; else 0."""
+        return ring_time(self.pokes) if self.pokes else 0.0
 
     def to_json(self) -> str:
         """The record as a JSON document with sorted keys.

@@ -37,7 +37,6 @@ from tactile.pokes import (
     learn_threshold,
     poke_angles,
     poke_observation,
-    ring_time,
 )
 from tactile.whisker_geometry import HeadConfig, ur10_head
 
@@ -162,7 +161,7 @@ class PokeSimulation(SimulatedSource):
         self.digest = digest_of_document(settings)
         why = "`simulation.touch` is force"
         self.info = SourceInfo(
-            interval=ring_time(pokes),
+            pokes=pokes,
             cell_size=POSE_CELL_SIZE,
             maze=maze_info(scene.maze, config.maze, seed),
             simulation=SimulationInfo(sha256=self.digest, seed=seed, tier="pokes", why=why),

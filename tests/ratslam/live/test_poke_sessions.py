@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ratslam.cli import main
 from robot.recordings.mcap_reader import Recording
+from tests.helpers.commands import refused, said
 from tests.helpers.live import ROOT, UR_FAULTS, started
 from tests.ratslam.live.bench import Bench
 from tests.ratslam.live.live_session import raise_priority
@@ -119,3 +121,17 @@ def test_a_wall_that_the_law_cannot_see_ends_the_session(bench: Bench) -> None:
         session.ends("contact")
         bench.stands()
         assert 0 < bench.arm.state()["penetration_max"] <= 0.004
+
+
+def test_a_map_of_pokes_is_for_pokes_of_the_same_reach(tmp_path, capsys):
+    short = ["--set", "simulation.path.circuits=C"]
+    assert main(["run", "poke_maze", "-o", str(tmp_path / "map"), *short]) == 0
+
+    def localise(config, *more):
+        return "localise", tmp_path / "map", config, "-o", tmp_path / "there", *short, *more
+
+    said_of_reach = refused(capsys, *localise("poke_maze", "--set", "touch.pokes.reach=0.2"))
+    assert "touch.pokes.reach is 0.2 and was 0.27" in said_of_reach
+    assert "pokes of an arm" in refused(capsys, *localise("whisker_maze"))
+    said(capsys, *localise("poke_maze"))
+    assert len((tmp_path / "there" / "steps.csv").read_text().splitlines()) > 50
