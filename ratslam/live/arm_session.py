@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ from ratslam.runs.saved_map import read_map
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.outcome import SessionOutcome
 from robot.live import arm_route
-from robot.live.live_config import LiveConfig
 from robot.live.live_rig import ArmRig, Rig
 from robot.live.poke_loop import PokeReport, learn_free_pokes, run_poke_loop
 from robot.live.polling import SessionFault, session_fault
@@ -144,8 +144,8 @@ class _ArmSession(LiveRobot):
     """The arm's part of a session.
 
     Args:
-        path: the route. stopped: whether the operator has requested the end. goals: the route to goals, if
-            there are any.
+        rig: its devices. path: the route. goals: the route to goals, if there are any. count: expected number
+            of readings along a path. described: the readings, without the facts that every arm shares.
     """
 
     rig: ArmRig
@@ -153,41 +153,31 @@ class _ArmSession(LiveRobot):
     def __init__(
         self,
         config: RunConfig,
+        rig: ArmRig,
         path: HeadPath,
         directory: Path,
-        stopped: Callable[[], bool],
-        goals: GoalRoute | None = None,
+        goals: GoalRoute | None,
+        count: Callable[[HeadPath], float],
+        described: SourceDescription,
     ) -> None:
         assert config.live is not None
-        self._config = config
+        self._config, self.rig = config, rig
         self._approach, self._descent, self._route = arm_route.arm_routes(config.live, path)
         live, plan, head = config.live, config.live.plan, ur10_head(config.touch.head)
-        self._open_rig(live, stopped)
         whole = arm_route.whole_path(live, head)
-        rows = ceil(1.5 * self._readings_along(whole)) if live.whisks is None else live.whisks
+        rows = ceil(1.5 * count(whole)) if live.whisks is None else live.whisks
         maze = (
             None if live.waypoints else maze_info(arm_route.plan_scene(plan, head).maze, plan.maze, plan.seed)
         )
         provenance = {"live": live.model_dump(mode="json", exclude={"plan": {"maze": {"file"}}})}
-        info = SourceInfo(cell_size=POSE_CELL_SIZE, maze=maze, provenance=provenance)
+        shared = {"cell_size": POSE_CELL_SIZE, "maze": maze, "provenance": provenance}
+        source = replace(described, info=described.info.model_copy(update=shared))
         extent = float(np.abs(whole.pose[:, :2] - whole.pose[0, :2]).max())
-        self.job = MappingJob(mapped_config(config, directory, rows), self._describe(info), directory, extent)
-        self.total = live.whisks or (None if goals else ceil(self._readings_along(path)))
+        self.job = MappingJob(mapped_config(config, directory, rows), source, directory, extent)
+        self.total = live.whisks or (None if goals else ceil(count(path)))
         self._goals = goals
         self._steering: GoalSteering | None = None
         self._reports: list[WhiskReport | PokeReport] = []
-
-    def _open_rig(self, live: LiveConfig, stopped: Callable[[], bool]) -> None:
-        """Sets `rig`."""
-        raise NotImplementedError
-
-    def _readings_along(self, path: HeadPath) -> float:
-        """Expected number of readings along a path."""
-        raise NotImplementedError
-
-    def _describe(self, info: SourceInfo) -> SourceDescription:
-        """The readings of the session."""
-        raise NotImplementedError
 
     @property
     def end(self) -> SessionOutcome:
@@ -199,12 +189,12 @@ class _ArmSession(LiveRobot):
         route: arm_route.ArmRoute = self._route
         if self._goals is not None:
             route = self._steering = GoalSteering(self._goals, self.rig, mapper, self._reports)
-        self._run_loop(route, mapper, tell)
+        self.run_loop(route, mapper, tell)
         fault = self._steering and self._steering.fault()
         if fault:
             raise fault
 
-    def _run_loop(self, route: arm_route.ArmRoute, mapper: Mapper, tell: Callable[[str], None]) -> None:
+    def run_loop(self, route: arm_route.ArmRoute, mapper: Mapper, tell: Callable[[str], None]) -> None:
         """Passes on the readings along a route."""
         raise NotImplementedError
 
@@ -227,22 +217,22 @@ class WhiskSession(_ArmSession):
     unit = "whisk"
     rig: Rig
 
-    def _open_rig(self, live: LiveConfig, stopped: Callable[[], bool]) -> None:
-        self.rig = Rig(live, self._config.touch.head, stopped)
+    def __init__(
+        self,
+        config: RunConfig,
+        path: HeadPath,
+        directory: Path,
+        stopped: Callable[[], bool],
+        goals: GoalRoute | None = None,
+    ) -> None:
+        live, head = config.live, ur10_head(config.touch.head)
+        assert live is not None
+        rate, info = live.plan.whisking.rate, SourceInfo(raw_whiskers=True, head=config.touch.head)
+        source = SourceDescription(view_shape(config.touch.image, head), len(head.length), rate, info)
+        rig = Rig(live, config.touch.head, stopped)
+        super().__init__(config, rig, path, directory, goals, lambda path: path.duration * rate, source)
         self._dropped = self._lost = 0
         self._lateness = list[float]()
-
-    def _readings_along(self, path: HeadPath) -> float:
-        assert self._config.live is not None
-        return path.duration * self._config.live.plan.whisking.rate
-
-    def _describe(self, info: SourceInfo) -> SourceDescription:
-        config = self._config
-        assert config.live is not None
-        head = ur10_head(config.touch.head)
-        info = info.model_copy(update={"raw_whiskers": True, "head": config.touch.head})
-        shape, rate = view_shape(config.touch.image, head), config.live.plan.whisking.rate
-        return SourceDescription(shape, len(head.length), rate, info)
 
     def calibrate(self, log: Callable[[str], None]) -> Calibration:
         """Records free whisks above the start of the route."""
@@ -263,7 +253,7 @@ class WhiskSession(_ArmSession):
         whisking = self.rig.config.plan.whisking
         self.rig.driver.whisk(whisking, calibration.threshold[:, 1], calibration.mean[:, 1])
 
-    def _run_loop(self, route: arm_route.ArmRoute, mapper: Mapper, tell: Callable[[str], None]) -> None:
+    def run_loop(self, route: arm_route.ArmRoute, mapper: Mapper, tell: Callable[[str], None]) -> None:
         def count(whisk: WhiskReport) -> None:
             self._lateness.append(whisk.lateness)
             self._dropped, self._lost = self._dropped + (not whisk.seen), self._lost + whisk.missing
@@ -287,17 +277,24 @@ class PokeSession(_ArmSession):
 
     unit = "ring"
 
-    def _open_rig(self, live: LiveConfig, stopped: Callable[[], bool]) -> None:
-        self.rig = ArmRig(live, stopped)
+    def __init__(
+        self,
+        config: RunConfig,
+        path: HeadPath,
+        directory: Path,
+        stopped: Callable[[], bool],
+        goals: GoalRoute | None = None,
+    ) -> None:
+        assert config.live is not None
+        pokes, count = config.touch.pokes, config.touch.pokes.directions
+        source = SourceDescription((1, count, 1), count, 0.0, SourceInfo(pokes=pokes))
+        rig = ArmRig(config.live, stopped)
+
+        def rings(path: HeadPath) -> float:
+            return float(moved_length(path)[-1]) / pokes.every + 1
+
+        super().__init__(config, rig, path, directory, goals, rings, source)
         self._threshold = 0.0
-
-    def _readings_along(self, path: HeadPath) -> float:
-        return float(moved_length(path)[-1]) / self._config.touch.pokes.every + 1
-
-    def _describe(self, info: SourceInfo) -> SourceDescription:
-        pokes = self._config.touch.pokes
-        info = info.model_copy(update={"pokes": pokes})
-        return SourceDescription((1, pokes.directions, 1), pokes.directions, 0.0, info)
 
     def calibrate(self, log: Callable[[str], None]) -> None:
         """Pokes in free air above the start of the route."""
@@ -312,7 +309,7 @@ class PokeSession(_ArmSession):
         del calibration
         follow_route(self.rig, self._descent)
 
-    def _run_loop(self, route: arm_route.ArmRoute, mapper: Mapper, tell: Callable[[str], None]) -> None:
+    def run_loop(self, route: arm_route.ArmRoute, mapper: Mapper, tell: Callable[[str], None]) -> None:
         def count(ring: PokeReport) -> None:
             felt = f"{int(ring.contact.sum())} of {len(ring.contact)} pokes touched, {ring.took:.0f} s"
             tell(f"{self._count(ring, mapper)}{felt}")

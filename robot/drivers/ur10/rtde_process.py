@@ -213,15 +213,15 @@ class CommandThread:
             self._retreating = True
         newest = self.shared.latest()
         assert newest is not None
-        self._poke = self._begin_poke(order, target[:3] - here["tcp"][:3]) if order.do == "poke" else None
+        self._poke = None
+        if order.do == "poke":
+            pokes, way = PokeConfig.model_validate(order.pokes), target[:3] - here["tcp"][:3]
+            along = way / max(float(np.linalg.norm(way)), safety.MOVED_ON)
+            longest = round(pokes.before[1] * self.config.hz) + 1
+            first = self.shared.newest
+            self._poke = _Poke(order.number, along, first, longest, pokes, order.threshold)
         self.report(say="moving", number=order.number, operation=int(newest["operation"]))
         self.control.moveL(target.tolist(), order.speed, self.config.acceleration, True)
-
-    def _begin_poke(self, order: ArmCommand, way: np.ndarray) -> _Poke:
-        config = PokeConfig.model_validate(order.pokes)
-        longest = round(config.before[1] * self.config.hz) + 1
-        along = way / max(float(np.linalg.norm(way)), safety.MOVED_ON)
-        return _Poke(order.number, along, self.shared.newest, longest, config, order.threshold)
 
     def _revoked(self, order: ArmCommand) -> bool:
         stopped = order.stops != int(self.shared.control["stops"]) or self._requested_stops() != self._stopped

@@ -257,7 +257,7 @@ def driven_to_goal(graph: networkx.DiGraph, made: Maze) -> tuple[GoalDrive, np.n
         sample = arm.whisk()
         seen = frontend.observe(sample.reading)
         estimate = between(MAP_POSE, compose(sample.truth, random.normal(0, [0.005, 0.005, 0.03])))
-        route.see(estimate, felt_points(seen, TOUCH.image, HEAD), sample.truth, arm.poses[-1])
+        route.see(estimate, felt_points(seen, TOUCH), sample.truth, arm.poses[-1])
     way, node = np.array(arm.poses)[:, :2], graph.nodes[GOAL]
     goal = compose(MAP_POSE, np.array([node["x"], node["y"], 0.0]))[:2]
     return steered, way, float(np.hypot(*(way[-1] - goal)))

@@ -14,7 +14,7 @@ from ratslam.places.contact_alignment import ContactCloud, RememberedContacts
 from ratslam.places.localiser import Place, Visits
 from ratslam.recall.whisker_likelihood import PRIOR, estimate_background, log_odds_table, pixel_layout
 from tactile.base.se2 import between, compose
-from tactile.whisker_geometry import HeadConfig, ur10_head
+from tactile.frontend import TouchConfig
 
 RADIUS, CHANCE = 0.09, (0.01, 8.0)
 
@@ -68,7 +68,7 @@ def test_places_are_named_by_descending_evidence_and_passes_are_told_apart() -> 
     assert change.passes == 3
 
 
-HEAD, TALLEST = ur10_head(HeadConfig()), 0.05
+TOUCH = TouchConfig()
 LAYOUT, TOUCHED = pixel_layout((3, 6, 1)), [1, 7, 13]
 """The last: whiskers on the left."""
 
@@ -91,7 +91,7 @@ def corridor(reversed: bool = False) -> ContactMap:
         poses[:, 2], levels = np.pi, levels[:, LAYOUT.opposite]
     varied = np.concatenate([levels, np.roll(levels, 1, axis=1), np.zeros_like(levels)])
     table = log_odds_table(estimate_background(varied, LAYOUT.group), PRIOR)
-    return ContactMap(ground_along(poses), levels, LAYOUT, table, HEAD, TALLEST)
+    return ContactMap(ground_along(poses), levels, LAYOUT, table, TOUCH)
 
 
 def drive(count: int = 20, begin: float = 0.2, end: float = 0.6) -> np.ndarray:
@@ -124,7 +124,7 @@ def test_a_new_wall_stands_where_the_whiskers_touch_it_and_only_known_keyframes_
     assert new.sum() == 60
     assert (signs.points[new, 1] < -0.03).all()
     assert (signs.evidence[new] > 0).all()
-    points, touched = changing.contact_points(drive(), levels, HEAD, TALLEST)
+    points, touched = changing.contact_points(drive(), levels, TOUCH)
     assert touched.sum() == 120
     np.testing.assert_allclose(np.sort(signs.points[new, 0]), np.sort(points[:, right, 0].ravel()))
     levels = images(np.random.default_rng(3), 20)
@@ -167,7 +167,7 @@ def corridor_place(after: int = 0) -> Place:
 def changes(place: Place, ways: int, changed: int) -> list[Change]:
     """Those of a session along the corridor."""
     poses, levels = drive_ways(1, ways, changed)
-    return changing.session_changes(place, Visits(np.arange(len(poses)), poses, levels), HEAD, TALLEST)
+    return changing.session_changes(place, Visits(np.arange(len(poses)), poses, levels), TOUCH)
 
 
 def test_the_missing_wall_is_named_where_it_was_and_nothing_that_the_map_knows() -> None:
