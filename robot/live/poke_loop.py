@@ -23,6 +23,10 @@ LONGEST_REST = 2.0
 """Time at rest on a route that waits after which a ring is poked again, s."""
 
 
+SHARES = (1.0, 0.8, 0.6, 0.4, 0.2)
+"""Shares of the way of a poke that are tried, if the arm has no joints for its end."""
+
+
 class PokeReport(NamedTuple):
     """Report on a ring of pokes.
 
@@ -46,7 +50,7 @@ def learn_free_pokes(rig: ArmRig, pokes: PokeConfig) -> float:
     for target in poke_targets(arm, pokes, centre):
         along = (target - centre)[:3] / np.linalg.norm((target - centre)[:3])
         first = rig.arm.shared.newest
-        _poke(rig, target, pokes, float("inf"))
+        _poke(rig, centre, target, pokes, float("inf"))
         free.append(-rig.arm.states(first)["force"][:, :3] @ along)
         _return(rig, centre, pokes)
     return learn_threshold(pokes, free, arm.hz, arm.force_limit)
@@ -105,7 +109,7 @@ def _poke_ring(rig: ArmRig, mapper: AsyncMapper, pokes: PokeConfig, threshold: f
     depth, contact = np.full(len(targets), pokes.reach), np.zeros(len(targets), bool)
     for k, target in enumerate(targets):
         check_mapper(mapper)
-        touched = _poke(rig, target, pokes, threshold)
+        touched = _poke(rig, centre, target, pokes, threshold)
         if touched is not None:
             depth[k], contact[k] = np.linalg.norm((touched - centre)[:3]), True
         _return(rig, centre, pokes)
@@ -116,14 +120,21 @@ def _poke_ring(rig: ArmRig, mapper: AsyncMapper, pokes: PokeConfig, threshold: f
     return PokeReport(truth, depth, contact, time.monotonic() - began)
 
 
-def _poke(rig: ArmRig, target: np.ndarray, pokes: PokeConfig, threshold: float) -> np.ndarray | None:
-    """Pokes towards a target [6]; returns the tool pose [6] at the contact, or None without one."""
-    try:
-        rig.arm.poke(target, pokes, threshold)
-    except TargetRefused as error:
-        raise refusal(rig, error) from error
-    _wait(rig, lambda: rig.arm.touched is not None or rig.arm.arrived())
-    return rig.arm.touched
+def _poke(
+    rig: ArmRig, centre: np.ndarray, target: np.ndarray, pokes: PokeConfig, threshold: float
+) -> np.ndarray | None:
+    """Pokes from a centre towards a target [6], less far where the arm cannot reach it; returns the tool pose
+    [6] at the contact, or None without one."""
+    arm = rig.arm
+    for share in SHARES:
+        try:
+            arm.poke(np.array([*(centre + share * (target - centre))[:3], *centre[3:]]), pokes, threshold)
+        except TargetRefused as error:
+            raise refusal(rig, error) from error
+        _wait(rig, lambda: arm.touched is not None or arm.too_far or arm.arrived())
+        if not arm.too_far:
+            break
+    return arm.touched
 
 
 def _return(rig: ArmRig, centre: np.ndarray, pokes: PokeConfig) -> None:

@@ -131,8 +131,9 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
     Attributes:
         fault: the first reason to stop, or None. process: the RTDE process, or None. ready: whether it has
             measured the force at rest. refused: the failed connection, or None. pending: the last move.
-            touched: [6] tool pose at which the last poke met something, or None. armed: whether findings
-            become faults. lock: for a check with a subsequent command.
+            touched: [6] tool pose at which the last poke met something, or None. too_far: whether the arm
+            cannot reach its end. armed: whether findings become faults. lock: for a check with a subsequent
+            command.
     """
 
     def __init__(self, config: ArmConfig) -> None:
@@ -142,6 +143,7 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
         self.pending: PendingMove | None = None
         self.refused: StartupRefused | None = None
         self.touched: np.ndarray | None = None
+        self.too_far = False
         self.fault: Fault | None = None
         self.ready = self.armed = False
         self._started = (0, 0)  # number of a move; newest operation before it
@@ -238,7 +240,8 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
         Raises:
             TargetRefused: as `move`.
         """
-        return self._start("poke", tcp, pokes.speed, pokes=pokes.model_dump(), threshold=threshold)
+        slow = min(pokes.speed, self.config.speed)
+        return self._start("poke", tcp, slow, pokes=pokes.model_dump(), threshold=threshold)
 
     def _start(self, do: str, tcp: Any, speed: float | None, **more: Any) -> Move:
         with self.lock:  # a fault between check and command would not revoke it
@@ -247,7 +250,7 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
                 raise TargetRefused(f"the arm does not move: {self.fault or 'it is not armed'}")
             move = safety.plan_move(self.config, tcp, state["tcp"], speed)
             deadline = time.monotonic() + move.most + self.config.patience
-            self._elsewhere = self.touched = None
+            self._elsewhere, self.touched, self.too_far = None, None, False
             self.pending = self._order(do, move.target, move.speed, **more), move, deadline
         return move
 
@@ -337,9 +340,10 @@ class Arm(contextlib.AbstractContextManager["Arm"]):
                 self.refused = StartupRefused(refusal, "", cure)
             elif report["say"] == "moving":
                 self._started = report["number"], report["operation"]
-            elif report["say"] == "touched":
+            elif report["say"] in ("touched", "unreachable"):
                 if self.pending is not None and self.pending[0] == report["number"]:
-                    self.touched, self.pending = np.array(report["tcp"]), None
+                    self.pending, self.too_far = None, report["say"] == "unreachable"
+                    self.touched = None if self.too_far else np.array(report["tcp"])
             elif report["say"] == "fault":
                 outcome, detail = SessionOutcome[report["outcome"]], report["detail"]
                 if self.armed:

@@ -201,6 +201,9 @@ class CommandThread:
         if not self.control.isPoseWithinSafetyLimits(target.tolist()):
             # False is also the answer during a stop; the next state then shows the stop.
             time.sleep(MAX_MISSING_STATES / self.config.hz)
+            if order.do == "poke":  # the session pokes less far
+                self.report(say="unreachable", number=order.number)
+                return
             places = ", ".join(f"{v:.3f}" for v in target)
             self.hold(Finding(SessionOutcome.UNREACHABLE, f"no joint solution for ({places})"))
             return

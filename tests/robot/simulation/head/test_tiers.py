@@ -24,6 +24,7 @@ from tactile.base.se2 import between, integrate, wrap
 from tactile.base.types import Cycle, Whisk
 from tactile.calibration import Calibration, CalibrationConfig, calibrate
 from tactile.contact_threshold import ContactConfig, ShaftConfig, detect_contacts, stiffness
+from tactile.frontend import Frontend, TouchConfig
 from tactile.whisker_geometry import HeadConfig, ur10_head
 from tactile.whisking import WhiskDrive, WhiskingConfig, whisk_command
 
@@ -317,3 +318,20 @@ def test_a_seed_gives_the_same_noise_and_drift_for_ever():
     assert correlation == pytest.approx(np.exp(-0.01 / HALL_BASELINE.colour_time), abs=0.02)
     assert drift.std() == pytest.approx(HALL_BASELINE.drift * np.sqrt(4.0), rel=0.1)
     np.testing.assert_allclose([colour[0, 9, 3, 1], drift[3, 1]], [0.150775, 0.825184], atol=1e-6)
+
+
+def test_a_baseline_that_follows_holds_in_the_field_of_the_earth_and_that_of_the_calibration_does_not():
+    """On a route that turns in every cell, against the same session without a field."""
+
+    def contacts(field: float) -> list[np.ndarray]:
+        parts = {"maze": {"loop": 4}, "path": {"circuits": "C"}, "mechanics": {"baseline": {"field": field}}}
+        source = HeadSimulation(SimulationConfig.model_validate({"raw": True} | parts))
+        cycles = [sample.reading for sample in source]
+        heads = [Frontend(touch, source.calibration) for touch in (TouchConfig(), TouchConfig(baseline=None))]
+        return [np.array([head.features(cycle).contact for cycle in cycles]) for head in heads]
+
+    (free, _), threshold = contacts(0.0), ContactConfig().contact_sds
+    for strength in (0.5, 2.0):
+        tracked, calibrated = ((found != free).mean() for found in contacts(strength * threshold))
+        assert tracked < 0.002
+        assert strength < 1 or calibrated > 5 * max(tracked, 0.01)
