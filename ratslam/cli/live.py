@@ -82,26 +82,30 @@ def _live(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.report.verdict import summarise
     from ratslam.live.live_session import run_live_session
+    from ratslam.methods.method_registry import LOCALISING
+    from ratslam.runs.localise import check_assignments, describe_localisation, localising
     from ratslam.runs.run import catch_interrupt
     from robot.drivers.outcome import SessionOutcome
 
-    config, _ = _read_live_config(arguments, arguments.head)
+    config, live = _read_live_config(arguments, arguments.head)
     if arguments.localise is not None and arguments.resume is not None:
         raise InputError("--continue", "given with --localise", "one of them: a map grows or stays as it is")
     if arguments.localise is not None:
-        from ratslam.runs.localise import check_assignments, localising
         from ratslam.runs.saved_map import read_map
 
         saved = read_map(arguments.localise)
         check_assignments(arguments.set, saved)
         config = localising(config, saved)
     directory, target = run_directory(arguments), open_target(arguments)
-    with catch_interrupt("stopping the robot"), monitor() as start_monitor:
+    last_task = "stopping the robot" if live.topics is None else "ending the session"
+    with catch_interrupt(last_task), monitor() as start_monitor:
         ended, card = run_live_session(
             config, directory, tell, armed=start_monitor, view=target, resume=arguments.resume
         )
     if card is not None:
         print(f"{directory}/map.png shows the map, `run {directory}/config.yaml` maps the recording again")
+        if config.backend in LOCALISING.values():
+            print(describe_localisation(directory))
         print(summarise(directory, card, config.backend))
     tell(str(ended))
     if ended.outcome is SessionOutcome.INTERRUPTED:

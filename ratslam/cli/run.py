@@ -201,7 +201,9 @@ def run_directory(arguments: argparse.Namespace) -> Path:
 def _run(arguments: argparse.Namespace) -> int:
     prepare_jax()
     from evaluation.report.verdict import summarise
+    from ratslam.methods.method_registry import LOCALISING
     from ratslam.runs import map_results
+    from ratslam.runs.localise import describe_localisation
     from ratslam.runs.run import run
     from ratslam.service.viewer_link import open_viewer
 
@@ -218,6 +220,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.report:
         map_results.write_report([directory], directory / map_results.NAME)
         print(f"{directory / map_results.NAME} is a page about the run")
+    if config.backend in LOCALISING.values():
+        print(describe_localisation(directory))
     print(summarise(directory, card, config.backend))
     return INTERRUPTED if interrupted else 0
 

@@ -26,6 +26,7 @@ from robot.drivers.processes import urgent
 from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
 from robot.live.selftest import check_disk
+from robot.recordings.cdr import Event, doubts_of
 from robot.recordings.mcap_writer import Recorder
 from tactile.base.files import require_new_file
 from tactile.calibration import Calibration
@@ -68,7 +69,7 @@ def run_live_session(
     require_new_file(directory, parents=True)
     open_robot = choose(config, directory)
     log(check_disk(config.live, directory))
-    with urgent(), catch_interrupt("stopping the robot") as stopped, Mapper(mapping) as mapper:
+    with urgent(), catch_interrupt("ending the session") as stopped, Mapper(mapping) as mapper:
         robot = open_robot(stopped)
         robot.view, robot.resume = view, resume
         fault, standing, card = None, False, None
@@ -139,4 +140,5 @@ def _run(robot: LiveRobot, mapper: Mapper) -> None:
             robot.run(mapper, tell)
         except SessionFault as error:
             robot.rig.record_event("fault", str(error.fault))
+            mapper.warn(doubts_of([Event(robot.rig.now(), "fault", str(error.fault))]))
             raise

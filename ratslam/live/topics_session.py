@@ -12,6 +12,7 @@ import numpy as np
 
 from ratslam.live.live_robot import LiveRobot, mapped_config, mapper_status, quantiles
 from ratslam.live.mapper_process import Mapper, MappingJob
+from ratslam.runs.map_settings import views_of
 from ratslam.runs.settings.run_config import RunConfig
 from robot.live.map_publisher import MapPublisher, PoseReport
 from robot.live.topics_rig import TopicsRig, require_topics, run_topics_loop
@@ -62,6 +63,7 @@ class TopicsSession(LiveRobot):
             raise InputError(where, "no message yet that says how many sensors there are", "", cure)
         assert self._config.live is not None
         origin = {"live": self._config.live.model_dump(mode="json", include={"topics"})}
+        origin |= {} if self.rig.steps.whiskers else {"views": views_of(self._config)[1]}
         source = SourceDescription(shape, self.rig.steps.whiskers, 0.0, SourceInfo(provenance=origin))
         extent = 10.0 if self._config.grid.side is None else self._config.grid.side / 2
         mapped = mapped_config(self._config, self._directory, RESERVED)

@@ -132,23 +132,29 @@ def localise(
             map.
     """
     card, interrupted = run(localising(config, saved), directory, observers=observers)
-    file = directory / CHANGES  # maps of whiskers only
-    changes = read_changes(file) if file.exists() else []
-    lines = [_describe_course(directory / "localisation.csv"), *(change.describe() for change in changes)]
-    return card, "\n".join(lines), interrupted
+    return card, describe_localisation(directory), interrupted
 
 
-def _describe_course(path: Path) -> str:
-    """The course in words, from the file with state and probability of every step."""
-    steps = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:]]
+def describe_localisation(directory: Path) -> str:
+    """The course of a localisation in a sentence, with a line for each place at which the session does not
+    agree with the map.
+
+    Args:
+        directory: of the run, with the file of state and probability of every step.
+    """
+    text = (directory / "localisation.csv").read_text(encoding="utf-8")
+    steps = [line.split(",") for line in text.splitlines()[1:]]
     known = [state == Localisation.FOUND.name.lower() for _, state, *_ in steps]
     _, state, mass, *_ = steps[-1]
     state = state.replace("_", " ")
-    if not any(known):
-        return f"not found in {len(steps)} steps: {state}"
     lost = sum(before and not now for before, now in pairwise(known))
     again = f", lost {lost} time{'s' * (lost > 1)}" if lost else ""
-    return (
-        f"found after {known.index(True) + 1} of {len(steps)} steps, known in {sum(known)} of them{again}; "
-        f"at the end: {state}, probability {float(mass):.3f}"
-    )
+    course = f"not found in {len(steps)} steps: {state}"
+    if any(known):
+        course = (
+            f"found after {known.index(True) + 1} of {len(steps)} steps, known in {sum(known)} of them{again}"
+            f"; at the end: {state}, probability {float(mass):.3f}"
+        )
+    file = directory / CHANGES  # maps of whiskers only
+    changes = read_changes(file) if file.exists() else []
+    return "\n".join([course, *(change.describe() for change in changes)])

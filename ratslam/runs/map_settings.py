@@ -158,7 +158,8 @@ class Sensor(NamedTuple):
             geometry = {f"touch.head.{name}": value for name, value in head.items()}
             kind, made = WHISKER_HEAD, flat_settings(touch.image.model_dump(mode="json"), "touch.image.")
         else:
-            kind, made = VIEWS, _views_of(config)[1]
+            recorded = info.provenance.get("views")  # of finished views that a live session has made
+            kind, made = VIEWS, recorded if isinstance(recorded, dict) else views_of(config)[1]
         given = made | {f"templates.{name}": getattr(config.templates, name) for name in NORMALISATION}
         kept = [name for name in given if given[name] is not None or name.startswith("recording.")]
         # Lists for tuples, as a file gives them back.
@@ -221,7 +222,7 @@ def check_same_fov(where: str, of_map: RunConfig, other: RunConfig) -> None:
         where: the map, for the error.
     """
     fovs = [config.recall.sector_fov for config in (of_map, other)]
-    formats = [_views_of(config)[0] for config in (of_map, other)]
+    formats = [views_of(config)[0] for config in (of_map, other)]
     known = [fov for fov in fovs if not isinstance(fov, str)]
     same_format = formats[0] == formats[1] or "" in formats
     if not known or (abs(known[0] - known[1]) <= SAME_FOV if len(known) == 2 else same_format):
@@ -233,7 +234,7 @@ def check_same_fov(where: str, of_map: RunConfig, other: RunConfig) -> None:
     raise InputError(where, found, "a map of this sensor", cure)
 
 
-def _views_of(config: RunConfig) -> tuple[str, dict[str, Any]]:
+def views_of(config: RunConfig) -> tuple[str, dict[str, Any]]:
     """What the views of a recording are made of, in words, '' where it does not say; and the settings by
     which its images or ranges became views, where it is not one of views."""
     recording = config.recording

@@ -32,7 +32,7 @@ from robot.recordings.video import image_view
 from robot.sources.odometry import from_poses, from_velocities
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
-from tactile.base.se2 import between, compose, inverse, wrap
+from tactile.base.se2 import between, compose, integrate, inverse, wrap
 from tactile.base.types import Odometry, observation
 
 HISTORY = 30.0
@@ -175,6 +175,7 @@ class OdometryTrack:
         self._count = 0
         self._time: float | None = None
         self._value = np.zeros(3)
+        self._latest = deque[tuple[float, np.ndarray]](maxlen=every)  # times and values of this piece
         self._paths: tuple[_Path, ...] = (_Path(), _Path()) if every > 1 else (_Path(),)
         self._joined, self._newest = np.zeros(3), np.zeros(3)  # poses of the last joined row and message
         self._steps = deque[float](maxlen=101)
@@ -202,6 +203,7 @@ class OdometryTrack:
             event = self._judge(time - last, step, new, outage)
             if event[0] == PIECE:
                 self.piece += 1
+                self._latest.clear()
             elif step is None:
                 forward, left, turn = np.array([self._value, new]).T
                 motion = from_velocities(np.array([last, time]), forward, left, turn)[1, :3]
@@ -209,6 +211,7 @@ class OdometryTrack:
                 motion = step
             self._steps.append(time - last)
         self._time, self._value = time, new
+        self._latest.append((time, new))
         pose = self._newest = self._paths[0].add(motion)
         if self._every > 1:
             chosen = self._count % self._every == 0
@@ -265,8 +268,9 @@ class OdometryTrack:
             if not gap:
                 return "", ""
             return PIECE, f"no velocities for {dt:.3g} s: nobody knows how the robot moved meanwhile"
-        length = float(np.hypot(*step[:2]))
-        pace = length / dt
+        began, first = self._latest[0]
+        length, way = (float(np.hypot(*each[:2])) for each in (step, between(first, new)))
+        pace = way / (dt + self._latest[-1][0] - began)
         if gap or outage:
             said = f"no odometry for {dt:.3g} s; the pose after it is {length:.3g} m away"
             if self._goes_on(step, new, dt) and pace < max(JUMP * self._fastest, SLOWEST):
@@ -503,6 +507,10 @@ class TopicSteps:
         time, values = np.array(self._recent)[:, 0], np.array(self._recent)[:, 1:]
         held = self.track.held
         motion = from_velocities(time, *values.T) if held else from_poses(time, values)
+        assert self._topics.odometry is not None
+        if (every := self._topics.odometry.every) > 1:  # as `read_odometry` joins them
+            time, values = time[::every], values[::every]
+            motion = from_poses(time, integrate(motion[:, :3])[::every])
         poses = None if held else values
         track = MotionTrack(time, np.ones(len(time), bool), motion, None, held, poses)
         judge, where = (

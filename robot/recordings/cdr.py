@@ -150,6 +150,7 @@ DOUBTFUL = {
     "unusable": "messages could not be used",
     "garbage": "what came is no message",
     "remainders": "the robot may lose parts of its motion",
+    "fault": "a fault ended it",
 }
 """Events after which the input of a session is not clean, and what they say."""
 

@@ -9,6 +9,7 @@ its place and a setting that cures it. The judge changes no pose: it only refuse
 |---|---|---|
 | unit | typical interval, speed or turn beyond `UnitLimits`; the units that explain it are named | error |
 | unit | headings follow the motion only as degrees; starts of over `START` at over `FAST` m/s | error |
+| repeats | what is no unit's fault once repeated poses count as one | error |
 | unit | a path under `LEAST_PATH` at under `CRAWL` m/s: kilometres, or a robot that stood | warning |
 | jump | one of the few largest steps, over `JUMP` typical ones | error if faster than `UnitLimits.speed` |
 | gap | a velocity held over `GAP` median intervals (1 s at least), over `JUMP` typical steps | error |
@@ -403,8 +404,28 @@ def unit_errors(
             track = track._replace(truth=track.truth * (1, 1, np.pi / 180))
     robot = typical_motion(track)
     found = list(_absurd(robot, track.held, limits, cures))
+    if found and (repeated := _repeats(track, limits)):
+        found = [repeated]
     found += [each for each in _unlike_truth(robot, limits) if not found or "truth's" in each[0]]
     return errors + [InputError(where, *words) for words in found]
+
+
+def _repeats(track: MotionTrack, limits: UnitLimits) -> tuple[str, str, str] | None:
+    """Of a track that moves as no robot does: whether it does not, once each pose that is repeated counts
+    once. Finding, expectation, cure."""
+    rows = np.flatnonzero(track.moved)
+    changed = np.flatnonzero(track.motion[rows, :3].any(axis=1))
+    every = int(np.median(np.diff(changed))) if len(changed) > 4 and not track.held else 1
+    if every < 2:
+        return None
+    motion = track.motion[rows[changed]]
+    motion[1:, 3] = np.diff(track.time[rows[changed]])
+    once = track._replace(time=track.time[rows[changed]], moved=np.ones(len(motion), bool), motion=motion)
+    if _faults(typical_motion(once._replace(truth=None)), False, limits):
+        return None
+    found = f"{len(rows) - len(changed)} of {len(rows)} poses are the pose before again, mostly {every} alike"
+    cure = "drop the repeated ones, or publish them as often as they are measured"
+    return found, "each pose once", f"{cure}; of topics, --set recording.topics.odometry.every={every}"
 
 
 def _absurd(

@@ -100,7 +100,8 @@ class SourceInfo(Settings):
     """Extent of the box in the frame of the truth: x0, y0, x1, y1, m; of the largest if there are several."""
     provenance: dict[str, Any] = Field(default_factory=dict)
     """Generating configuration under its key in a run configuration (`simulation`, `create_simulation`,
-    `rat_simulation`, `live`), or `parameters` of a recording. Its reader validates it."""
+    `rat_simulation`, `live`), `views`: settings that made the views of a live session, or `parameters` of a
+    recording. Its reader validates it."""
 
     @property
     def interval(self) -> float:

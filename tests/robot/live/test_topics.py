@@ -230,6 +230,16 @@ def test_two_publishers_of_one_topic_end_the_session_with_their_name():
         events_of(sorted([*wheels, *(e for e in one if e.topic == "/scan")], key=lambda entry: entry.time))
 
 
+def test_poses_sent_many_times_end_the_session_with_the_setting_that_takes_each_once():
+    times = {"/odom": 20, "/scan": 1}
+    messages = [shifted([each], k * 1e-3)[0] for each in drive(15.0) for k in range(times[each.topic])]
+    with pytest.raises(SessionFault, match=r"mostly 20 alike.* --set recording.topics.odometry.every=20"):
+        events_of(messages)
+    told, found = events_of(messages, odometry={"topic": "/odom", "every": 20})
+    assert not {"gap", "piece"} & set(told)
+    assert len(found) > 100
+
+
 def test_a_clock_that_is_set_back_ends_the_session_and_one_set_ahead_does_not():
     def told_of(jump):
         entries = drive(8.0)

@@ -157,6 +157,22 @@ def test_a_fault_of_the_odometry_is_judged(kind):
     assert bool(alone) == (not kind.startswith(("two", "slow deg")))
 
 
+def test_poses_that_are_repeated_are_no_fault_of_a_unit():
+    """Each pose of a drive in steps of 20 ms, twenty times at 1000 Hz; in degrees it remains one."""
+    time, speeds, _ = _drive()
+    poses = integrate(from_velocities(time / 5, speeds[:, 0], 0.0, speeds[:, 1])[:, :3]).repeat(20, axis=0)
+    time = np.arange(len(poses)) * 1e-3
+    track = MotionTrack(time, time >= 0, from_poses(time, poses), poses=poses)
+    (error,) = InputJudge().errors(track, str, "file")
+    for piece in ("poses are the pose before again, mostly 20 alike", "recording.topics.odometry.every=20"):
+        assert piece in str(error)
+    once = MotionTrack(time[::20], time[::20] >= 0, from_poses(time[::20], poses[::20]), poses=poses[::20])
+    assert InputJudge(warn=pytest.fail).errors(once, str, "file") == []
+    degrees = poses * [1, 1, np.degrees(1)]
+    (error,) = InputJudge().errors(track._replace(motion=from_poses(time, degrees), poses=degrees), str, "f")
+    assert "again" not in str(error)
+
+
 @pytest.mark.parametrize("kind", ["clean, poses", "clean, velocities"])
 def test_a_clean_drive_has_no_finding(kind):
     assert InputJudge(warn=pytest.fail).errors(_faulty(kind), str, "file") == []
