@@ -16,6 +16,7 @@ from types import FrameType
 # Only the imports of argparse are made here, so that `--help` does not wait for JAX and NumPy.
 from ratslam.cli import doctor, live, maps, run, tools
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, TERMINATED, Commands
+from robot.drivers.processes import postpone_interrupt
 from tactile.base.errors import InputError, printable, tell
 from tactile.base.files import FULL
 
@@ -35,15 +36,15 @@ def main(argv: list[str] | None = None) -> int:
     """Parses the arguments and runs one command; returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     arguments = build_parser().parse_args(argv)
-    with _sigterm_as_interrupt() as terminated:
+    with _catch_signals() as terminated:
         code = _run_command(arguments)
     return TERMINATED if code == INTERRUPTED and terminated else code
 
 
 @contextmanager
-def _sigterm_as_interrupt() -> Iterator[list[int]]:
-    """Lets SIGTERM (of `kill`, `timeout`, systemd, Docker) do what Ctrl-C does; yields the list to which each
-    is added."""
+def _catch_signals() -> Iterator[list[int]]:
+    """Lets SIGTERM (of `kill`, `timeout`, systemd, Docker) do what Ctrl-C does, and Ctrl-C wait for a moment
+    at which it is not lost; yields the list to which each SIGTERM is added."""
     caught: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield caught
@@ -56,11 +57,18 @@ def _sigterm_as_interrupt() -> Iterator[list[int]]:
             raise KeyboardInterrupt
         handler(signal.SIGINT, frame)
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    def interrupt_later(number: int, frame: FrameType | None) -> None:
+        if not postpone_interrupt(frame):
+            raise KeyboardInterrupt
+
+    before, usual = signal.signal(signal.SIGTERM, interrupt), signal.getsignal(signal.SIGINT)
+    if usual is signal.default_int_handler:
+        signal.signal(signal.SIGINT, interrupt_later)
     try:
         yield caught
     finally:
         signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGINT, usual)
 
 
 def _run_command(arguments: argparse.Namespace) -> int:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import os
 import signal
 import sys
 import threading
@@ -21,6 +19,7 @@ from ratslam.core.session import CHUNK
 from ratslam.runs.build_session import open_observations, open_source
 from ratslam.runs.runner import Observer, Runner, open_runner
 from ratslam.runs.settings.run_config import RunConfig
+from robot.drivers.processes import postpone_interrupt
 from robot.recordings.mcap_writer import Recorder
 from robot.sources.source import Source
 from tactile.base.errors import InputError, printable, tell
@@ -28,8 +27,6 @@ from tactile.base.types import Cycle, Whisk
 from tactile.frontend import Frontend
 
 LAST_TASK = "finishing this chunk and writing the results"
-RETRY = 0.01
-"""Time after which a Ctrl-C that came at a bad moment is sent again, s."""
 
 
 def run(
@@ -146,12 +143,7 @@ class _Interrupts:
         return self._count > 0
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        # In a callback of the garbage collector (JAX has one), Python would print the exception and go on.
-        codes = [getattr(callback, "__code__", None) for callback in gc.callbacks]
-        while frame is not None and frame.f_code not in codes:
-            frame = frame.f_back
-        if self._count == 1 and frame is not None:
-            threading.Timer(RETRY, os.kill, (os.getpid(), signal.SIGINT)).start()
+        if self._count == 1 and postpone_interrupt(frame):
             return
         self._count += 1
         if self._count == 1:

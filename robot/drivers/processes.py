@@ -10,14 +10,41 @@ them itself.
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
+import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
+from types import FrameType
 
 WINDOW = 1.0
 """Time for which the largest delay counts, s."""
+RETRY = 0.01
+"""Time after which a Ctrl-C that came at a bad moment is sent again, s."""
+
+
+def postpone_interrupt(frame: FrameType | None) -> bool:
+    """Sends a Ctrl-C again after `RETRY`, if it came at a moment at which an exception is lost.
+
+    In a callback of the garbage collector (JAX has one), Python would print the exception and go on; while a
+    compiled module is imported, it would become an `ImportError`.
+
+    Args:
+        frame: where it came.
+
+    Returns:
+        whether it did so.
+    """
+    callbacks = [getattr(callback, "__code__", None) for callback in gc.callbacks]
+    while frame is not None:
+        code = frame.f_code
+        if code in callbacks or code.co_qualname.startswith("ExtensionFileLoader."):
+            threading.Timer(RETRY, os.kill, (os.getpid(), signal.SIGINT)).start()
+            return True
+        frame = frame.f_back
+    return False
 
 
 class LatenessMeter:
