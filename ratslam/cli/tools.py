@@ -137,10 +137,12 @@ def add_check(commands: Commands) -> None:
             "--set", action="append", default=[], metavar="settings.a=value",
             help="replace a setting of it; may be repeated",
         )  # fmt: skip
-    robot = kinds.add(
-        "robot", _check_robot, "drive a robot and measure its odometry", "check robot create live_create"
-    )
-    robot.add_argument("robot", choices=("create",), help="create: a Create 1 or 2, on 2 m of free floor")
+    robot = kinds.add("robot", _check_robot, "move a robot and measure it", "check robot create live_create")
+    robot.add_argument(
+        "robot", choices=("create", "arm", "head"),
+        help="create: odometry of a Create 1 or 2, on 2 m of free floor; arm: force and states of an arm, by "
+        "pokes in free air; head: whiskers on an arm, by whisks in free air",
+    )  # fmt: skip
     robot.add_path(
         "config", "CONFIG",
         "configuration of a live session, or the bench.json of an earlier check, to judge it with marks",
@@ -150,9 +152,11 @@ def add_check(commands: Commands) -> None:
         "--turned-deg",
         type=_positive_number,
         metavar="DEG",
-        help="true amount of the first turn, degrees",
+        help="create: true amount of the first turn, degrees",
     )
-    robot.add_argument("--drove-m", type=_positive_number, metavar="M", help="true way of the first drive, m")
+    robot.add_argument(
+        "--drove-m", type=_positive_number, metavar="M", help="create: true way of the first drive, m"
+    )
     add_set(robot)
     source, touch = kinds.parsers["source"], kinds.parsers["touch"]
     source.add_argument(
@@ -202,7 +206,7 @@ def _check(kind: str, arguments: argparse.Namespace) -> int:
 
 
 def _check_robot(arguments: argparse.Namespace) -> int:
-    """Drives a robot, or judges the record of an earlier check, and says what was found."""
+    """Moves a robot, or judges the record of an earlier check, and says what was found."""
     from ratslam.service.robot_check import ROBOTS, RobotRequest
 
     def ask(question: str) -> float | None:

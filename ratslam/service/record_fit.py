@@ -53,7 +53,7 @@ def read_signals_of_reach(source: PluginConfig) -> SignalRecord:
     return SignalRecord(free, signal, block, apart, contact, real_whiskers.WHISKERS, "counts")
 
 
-def _signals_of_cycles(samples: list[Sample]) -> SignalRecord:
+def signals_of_cycles(samples: list[Sample]) -> SignalRecord:
     """The deflections of a whisker head at rest, at the start of each cycle.
 
     Raises:
@@ -71,7 +71,7 @@ def _signals_of_cycles(samples: list[Sample]) -> SignalRecord:
     return SignalRecord(record, record, rest, apart, np.zeros(whiskers), names, "rad")
 
 
-def _signal_rig(record: SignalRecord, fit: SignalFit, registered: bool) -> Rig:
+def signal_rig(record: SignalRecord, fit: SignalFit, registered: bool) -> Rig:
     """The signals as a rig: medians over the channels of live whiskers, and a line for each whisker."""
     live = ~fit.dead
     quantities = []
@@ -123,7 +123,7 @@ def fit_record(config: RunConfig, seed: int = 0) -> Rig:
         return _fit_stage(config.source)
     if config.source is not None and config.source.plugin == "whisker_reach":
         record = read_signals_of_reach(config.source)
-        return _signal_rig(record, fit_signals(record), registered=True)
+        return signal_rig(record, fit_signals(record), registered=True)
     plain = _without_correction(config)
     with open_source(plain) as source:
         completed = complete(plain, source)
@@ -132,8 +132,8 @@ def fit_record(config: RunConfig, seed: int = 0) -> Rig:
     parts = [fit_wheels_of(config, completed, samples, seed)]
     if info.raw_whiskers and info.planar_whiskers is None:
         try:
-            record = _signals_of_cycles(samples)
-            parts.append(_signal_rig(record, fit_signals(record), registered=False))
+            record = signals_of_cycles(samples)
+            parts.append(signal_rig(record, fit_signals(record), registered=False))
         except InputError as error:
             alive = [sample.reading.alive for sample in samples if isinstance(sample.reading, Whisk)]
             dead = np.flatnonzero(~np.any(alive, axis=0)).tolist() if alive else []

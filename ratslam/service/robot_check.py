@@ -13,14 +13,20 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ratslam.runs.run import catch_interrupt
 from ratslam.runs.settings.run_config import load_config
+from ratslam.service.arm_check import judge_arm, judge_head
 from ratslam.service.create_check import Verdict, judge_create
 from ratslam.service.rig_fit import Rig, aligned
 from robot.drivers.create.driver import CreateDriver
 from robot.drivers.create.driver_config import CreateConfig
+from robot.live import arm_bench
 from robot.live.create_bench import Bench, BenchPlan, BenchRun, drive_bench, runs_of_data, runs_to_data
+from robot.live.live_config import LiveConfig
+from robot.live.poke_loop import FreePokes
 from tactile.base.errors import InputError, tell
 from tactile.base.files import new_folder
+from tactile.frontend import TouchConfig
 
 FORMAT = "ratslam-bench-1"
 FINE, UNKNOWN = "fine", "cannot tell"
@@ -105,6 +111,56 @@ def check_create(request: RobotRequest, plan: BenchPlan | None = None) -> RobotR
     return RobotReport(verdicts, rig, {**data, "runs": runs_to_data(runs)})
 
 
+def check_arm(request: RobotRequest, trials: int = arm_bench.TRIALS) -> RobotReport:
+    """Checks force, states and position of an arm by pokes in free air, in about four minutes."""
+    live, touch, record = _record_of(request, "arm", FreePokes, trials)
+    return _report("arm", live, touch, record, judge_arm(live, touch, record))
+
+
+def check_head(request: RobotRequest, trials: int = arm_bench.TRIALS) -> RobotReport:
+    """Checks the whiskers of a head on an arm by whisks in free air, in about a minute."""
+    live, touch, record = _record_of(request, "head", arm_bench.FreeWhisks, trials)
+    return _report("head", live, touch, record, judge_head(live, touch, record))
+
+
+def _record_of(
+    request: RobotRequest, robot: str, kind: Callable[..., Any], trials: int
+) -> tuple[LiveConfig, TouchConfig, Any]:
+    """Settings and record of an arm or its head: measured now, or of an earlier check."""
+    if any(mark is not None for mark in request.marks.values()):
+        raise InputError(f"check robot {robot}", "a mark", "marks with `check robot create` only")
+    if request.config.suffix == ".json":
+        with _reading(request.config, robot) as stored:
+            settings = stored["settings"]
+            record = arm_bench.record_of_text(kind, stored["record"])
+            return LiveConfig(**settings["live"]), TouchConfig(**settings["touch"]), record
+    config = load_config(request.config, request.settings)
+    live, touch = config.live, config.touch
+    if live is None or live.create is not None or live.topics is not None:
+        raise InputError(f"{request.config}: live.arm", "missing", "the settings of an arm")
+    with catch_interrupt("stopping the robot") as stopped:
+        if robot == "arm":
+            return live, touch, arm_bench.poke_in_air(live, touch.head, touch.pokes, stopped, tell, trials)
+        if live.arm.touch == "force":
+            cure = "`check robot arm` checks an arm without one"
+            raise InputError(f"{request.config}: live.arm.touch", "force", "a whisker head", cure)
+        return live, touch, arm_bench.whisk_in_air(live, touch.head, stopped, tell, trials)
+
+
+KEPT = {name: True for name in ("arm", "head", "gap", "grace", "residual")} | {
+    "plan": {"whisking": True, "calibration": True}
+}
+"""Settings of `live` that a record keeps."""
+
+
+def _report(
+    robot: str, live: LiveConfig, touch: TouchConfig, record: Any, judged: tuple[list[Verdict], Rig]
+) -> RobotReport:
+    settings = {"live": live.model_dump(mode="json", include=KEPT), "touch": touch.model_dump(mode="json")}
+    data = {"robot": robot, "version": version("ratslam"), "settings": settings}
+    return RobotReport(*judged, {**data, "record": arm_bench.record_to_text(record)})
+
+
 @contextmanager
 def _reading(file: Path, robot: str) -> Iterator[dict[str, Any]]:
     """The record of an earlier check; what is wrong with it is an `InputError`."""
@@ -120,5 +176,9 @@ def _reading(file: Path, robot: str) -> Iterator[dict[str, Any]]:
         raise InputError(str(file), f"cannot be read ({type(error).__name__})", expected) from None
 
 
-ROBOTS: dict[str, Callable[[RobotRequest], RobotReport]] = {"create": check_create}
+ROBOTS: dict[str, Callable[[RobotRequest], RobotReport]] = {
+    "create": check_create,
+    "arm": check_arm,
+    "head": check_head,
+}
 """The checks by the name of the robot."""

@@ -40,20 +40,64 @@ class PokeReport(NamedTuple):
     took: float
 
 
+class FreePokes(NamedTuple):
+    """P pokes in free air, with their N states one after the other.
+
+    Attributes:
+        angle: [P] directions in the base frame, rad. touched: [P] ways up to a contact, m; NaN without one.
+        back: [P] distances of the tool from its centre afterwards, m. states: [P] number of each. push: [N]
+            force against the tool along its way, N. robot, host: [N] times of the states, s. ages: [M] age of
+            the newest state at each poll, s.
+    """
+
+    angle: np.ndarray
+    touched: np.ndarray
+    back: np.ndarray
+    states: np.ndarray
+    push: np.ndarray
+    robot: np.ndarray
+    host: np.ndarray
+    ages: np.ndarray
+
+    def each(self, values: np.ndarray) -> list[np.ndarray]:
+        """The values [N] of each poke."""
+        return np.split(values, np.cumsum(self.states)[:-1])
+
+
+def record_free_pokes(rig: ArmRig, pokes: PokeConfig) -> FreePokes:
+    """Pokes in free air, once in each direction; of a long one at 500 states/s the last 8 s are recorded.
+
+    Raises:
+        robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
+    """
+    centre, rows, parts, seen = _here(rig), [], [], len(rig.state_ages)
+    for target in poke_targets(rig.config.arm, pokes, centre):
+        way = target[:3] - centre[:3]
+        if np.linalg.norm(way) <= rig.config.arm.arrive:  # at the border of the box
+            continue
+        first = rig.arm.shared.newest
+        touched = _poke(rig, centre, target, pokes, float("inf"))
+        new = rig.arm.states(first)
+        push = -new["force"][:, :3] @ (way / np.linalg.norm(way))
+        parts.append(np.stack([push, new["robot"], new["host"]]))
+        _return(rig, centre, pokes)
+        depth = np.nan if touched is None else np.linalg.norm((touched - centre)[:3])
+        back = np.linalg.norm((_here(rig) - centre)[:3])
+        rows.append((np.arctan2(way[1], way[0]), depth, back, len(new)))
+    angle, depths, backs, states = np.array(rows).T
+    push, robot, host = np.concatenate(parts, axis=1)
+    ages = np.array(rig.state_ages[seen:])
+    return FreePokes(angle, depths, backs, states.astype(int), push, robot, host, ages)
+
+
 def learn_free_pokes(rig: ArmRig, pokes: PokeConfig) -> float:
     """Pokes in free air, once in each direction; returns the threshold of the rise, N.
 
     Raises:
         InputError: the force is too uneven. robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
     """
-    free, centre, arm = list[np.ndarray](), _here(rig), rig.config.arm
-    for target in poke_targets(arm, pokes, centre):
-        along = (target - centre)[:3] / np.linalg.norm((target - centre)[:3])
-        first = rig.arm.shared.newest
-        _poke(rig, centre, target, pokes, float("inf"))
-        free.append(-rig.arm.states(first)["force"][:, :3] @ along)
-        _return(rig, centre, pokes)
-    return learn_threshold(pokes, free, arm.hz, arm.force_limit)
+    record, arm = record_free_pokes(rig, pokes), rig.config.arm
+    return learn_threshold(pokes, record.each(record.push), arm.hz, arm.force_limit)
 
 
 def run_poke_loop(

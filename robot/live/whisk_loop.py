@@ -146,14 +146,21 @@ def _next_sequence(rig: Rig, number: int) -> _WhiskSequence:
     return _WhiskSequence(number, first, device, start, round(count), 1 / rate)
 
 
-def record_free_whisks(rig: Rig, count: int) -> list[Cycle]:
-    """Records whisks in free air, as raw cycles, for the calibration."""
+def record_free_whisks(rig: Rig, count: int, late: list[float] | None = None) -> list[Cycle]:
+    """Records whisks in free air, as raw cycles, for the calibration.
+
+    Args:
+        late: takes the time from the end of each to its last sample, s.
+    """
     sequence = _next_sequence(rig, 0)
     record = []
     for number in range(count):
         first, last = sequence.frame_range(number)
         arrived, longest = partial(_has_arrived, rig, last), 3 * sequence.period + 1.0
         rig.wait_until(arrived, longest, SessionOutcome.HEAD_SILENT, "a whisk")
+        if late is not None:
+            due = float(rig.stream.clock.to_host(sequence.device + sequence.start_of(number + 1)))
+            late.append(time.monotonic() - due)
         frames = rig.head.ring.between(first, last)
         begin = sequence.start_of(number)
         cut = Cut.of(number, begin, begin, frames, Odometry(0.0, 0.0, 0.0, 0.0))
