@@ -68,14 +68,16 @@ def smooth_rates(rates: np.ndarray, seconds: np.ndarray, sigma: float) -> np.nda
     return sums / np.where(weight, smooth_plane(weight * seconds, sigma), np.nan)
 
 
-def smooth_plane(values: np.ndarray, sigma: float) -> np.ndarray:
+def smooth_plane(values: np.ndarray, sigma: float, squared: bool = False) -> np.ndarray:
     """Values [..., H, W] smoothed by a Gaussian of `sigma` bins, cut off at 4 sigma, mirrored at the walls.
+
+    With `squared` the weights are squared, which makes variances of them.
 
     The value beside a wall is repeated outside (d c b a | a b c d), so no activity leaves the box. NaN
     spread; smooth `numpy.nan_to_num(values)` and the mask of visited bins and divide to ignore them.
     """
-    height, width = values.shape[-2:]
-    return _kernel(height, sigma) @ values @ _kernel(width, sigma).T
+    height, width = (_kernel(bins, sigma) for bins in values.shape[-2:])
+    return height**2 @ values @ width.T**2 if squared else height @ values @ width.T
 
 
 class BoxSamples(NamedTuple):
@@ -250,6 +252,20 @@ def heading_index(truth: np.ndarray, bins: int) -> np.ndarray:
     known_poses(truth)
     known = np.isfinite(truth[:, 2])
     return np.where(known, circle_bin(np.where(known, truth[:, 2], 0.0), bins), -1)
+
+
+def running_speed(time: np.ndarray, truth: np.ndarray, window: float = 0.4) -> np.ndarray:
+    """[T] m/s: the distance between the places half a window before and after, over the time between them.
+
+    NaN where one is unknown. A tracker's jitter within the window is not motion.
+
+    Args:
+        time: [T] s. truth: [T, 3] m, m, rad. window: s.
+    """
+    first = np.searchsorted(time, time - window / 2 - 1e-9)
+    last = np.searchsorted(time, time + window / 2 + 1e-9, side="right") - 1
+    elapsed = time[last] - time[first]
+    return np.hypot(*(truth[last, :2] - truth[first, :2]).T) / np.where(elapsed > 0, elapsed, np.nan)
 
 
 def circle_bin(angle: np.ndarray, bins: int) -> np.ndarray:

@@ -1,19 +1,23 @@
-"""The recorded activity of pose cells: type and file."""
+"""The recorded activity of cells: of pose cells, type and file; of an animal's cells, made from spikes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from tactile.base.bounded import read_npz
+from tactile.base.errors import InputError
 from tactile.base.files import write_atomically
 
 NAME = "cells.npz"
 """The file in a run directory."""
 FORMAT = "ratslam-cells-1"
 """Text `format` in the file."""
+GAP = 10.0
+"""Median intervals between samples above which the place is unknown in between."""
 
 
 class BinnedSums(NamedTuple):
@@ -35,10 +39,11 @@ class BinnedSums(NamedTuple):
 
 
 class CellRecording(NamedTuple):
-    """The activity of pose cells over the T steps of a session.
+    """The activity of cells over the T steps of a session.
 
     Attributes:
-        shape: (K, N, N) cells of the network over heading, y, x. cell_size: side of a cell, m.
+        shape: (K, N, N) cells of the network over heading, y, x; (0, 0, 0) of cells of an animal, whose
+            activity is in spikes/s (`record_spikes`). cell_size: side of a cell, m.
         time: [T] s. truth: [T, 3] true pose, m, m, rad, NaN where unknown. packet: [T, 3] decoded pose over
             x, y, heading, cells. energy: [T] injected by views; of a belief its total. place: [T] int32 id of
             the place or view template, -1 for none.
@@ -69,6 +74,50 @@ class CellRecording(NamedTuple):
         """Periods of the torus over x, y (m) and heading (rad)."""
         _, height, width = self.shape
         return width * self.cell_size, height * self.cell_size, 2 * np.pi
+
+
+def record_spikes(
+    time: np.ndarray,
+    truth: np.ndarray,
+    spikes: Sequence[np.ndarray],
+    observed: np.ndarray | None = None,
+) -> CellRecording:
+    """Spikes of cells of an animal on its path, as a recording with an activity in spikes/s.
+
+    A spike belongs to the nearest sample, as in pynapple. Between samples that lie more than `GAP` median
+    intervals apart the place is unknown, and that time and its spikes do not count.
+
+    Args:
+        time: [T] s, increasing. truth: [T, 3] m, m, rad, NaN where unknown. spikes: of each of C cells the
+            times [n], s. observed: [K, 2] s, outside of which nothing counts; None: all of it.
+
+    Raises:
+        InputError: there are no cells, lengths differ, or times do not increase.
+    """
+    time, truth = np.asarray(time, np.float64), np.asarray(truth, np.float64)
+    steps = np.diff(time)
+    if not len(spikes) or truth.shape != (len(time), 3) or len(time) < 2 or not (steps > 0).all():
+        found = f"{len(time)} times, poses of shape {truth.shape} and {len(spikes)} cells"
+        raise InputError("spikes", found, "[T] increasing times, [T, 3] poses and one cell or more")
+    usual = float(np.median(steps))
+    gaps = np.flatnonzero(steps > GAP * usual)
+    ends = np.repeat(
+        gaps + 1, 2
+    )  # a sample of unknown place follows each gap's begin, another precedes its end
+    time = np.insert(time, ends, np.column_stack([time[gaps] + usual, time[gaps + 1] - usual]).ravel())
+    truth = np.insert(truth, ends, np.nan, axis=0)
+    if observed is not None:
+        outside = [(time < first) | (time > last) for first, last in observed]
+        truth[np.all(outside, axis=0)] = np.nan
+    middle = (time[1:] + time[:-1]) / 2
+    borders = np.concatenate([[time[0] - usual / 2], middle, [time[-1] + usual / 2]])
+    seconds = np.diff(time, prepend=time[0] - usual)[:, None]
+    counts = np.stack([np.histogram(each, borders)[0] for each in spikes], axis=1)
+    unknown = np.full((len(time), 3), np.nan)
+    return CellRecording(
+        (0, 0, 0), np.nan, time, truth, unknown, unknown[:, 0], np.full(len(time), -1, np.int32),
+        np.arange(len(spikes), dtype=np.int32), counts / seconds, None,
+    )  # fmt: skip
 
 
 _SUMS = "sums/"

@@ -19,17 +19,22 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import binom
 
+from evaluation.cells import rate_map
+from evaluation.cells.recording import CellRecording
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
 Score = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Scores [n] from the mean activity [n, *shape], NaN in bins without visits, and the seconds [*shape]."""
+"""Scores [n] from the mean activity [n, *shape], NaN in bins without visits, and the seconds [*shape]; or
+several at once, [k, n]."""
 
 SHORTEST_SHIFT = 20.0
 """Shortest shift of a shuffle, s, either way round."""
 PERCENTILE = 0.95
 _FEWEST = 19
 """Fewest shuffles from which rank 0.95 (S + 1) exists."""
+SPEED_BIN, SPEED_BINS = 0.02, 20
+"""Width, m/s, and number of the bins of the running speed."""
 
 
 class PathBins(NamedTuple):
@@ -50,6 +55,7 @@ class ShuffledScores(NamedTuple):
 
     Attributes:
         score: [C] of the cells as recorded. shuffled: [S, C] of their shuffles. NaN where there is no score.
+            Of k scores at once [k, C] and [S, k, C].
     """
 
     score: np.ndarray
@@ -75,6 +81,11 @@ class ShuffledScores(NamedTuple):
         known = np.isfinite(self.shuffled)
         count = np.where(known.any(axis=0), known.sum(axis=0), np.nan)
         return np.where(known, self.shuffled, 0.0).sum(axis=0) / count
+
+    @property
+    def corrected(self) -> np.ndarray:
+        """[C] score minus the mean of its shuffles: of an information, without the bias of few spikes."""
+        return self.score - self.mean
 
     @property
     def above(self) -> np.ndarray:
@@ -122,6 +133,29 @@ def shuffled_scores(
     shape = shuffles, activity.shape[1]
     shifts = stream(seed, "cell shuffles").integers(shortest, samples - shortest + 1, shape)
     return _score_shifts(activity, bins, score, shifts)
+
+
+def path_bins(recording: CellRecording, kind: str) -> PathBins:
+    """The bin of each step by a kind: `place`, 20 x 20 over the box that the path fills; `heading`, 36;
+    `joint`, 8 x 10 x 10 of both; `speed`, 20 of 2 cm/s.
+
+    Raises:
+        InputError: lengths differ, no pose is known or the path has no area.
+    """
+    turns, across = (8, 10) if kind == "joint" else (36, 20)
+    seconds = rate_map.sample_seconds(recording.time)
+    place = rate_map.place_index(recording.truth, *rate_map.arena_edges(recording.truth, across))
+    heading = rate_map.heading_index(recording.truth, turns)
+    if kind == "place":
+        return PathBins(np.where(heading < 0, -1, place), (across, across), seconds)
+    if kind == "heading":
+        return PathBins(np.where(place < 0, -1, heading), (turns,), seconds)
+    if kind == "speed":
+        speed = rate_map.running_speed(recording.time, recording.truth)
+        known = (heading >= 0) & (place >= 0) & (speed < SPEED_BIN * SPEED_BINS)
+        return PathBins(np.where(known, speed // SPEED_BIN, -1).astype(int), (SPEED_BINS,), seconds)
+    both = np.where((place < 0) | (heading < 0), -1, heading * across**2 + place)
+    return PathBins(both, (turns, across, across), seconds)
 
 
 def calibrate(

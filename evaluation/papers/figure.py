@@ -23,6 +23,9 @@ CELLS = {
     "agreement": "cells.agreement.FIGURE",
     "shuffles": "cells.shuffles.FIGURE",
     "networks": "cells.costs.NETWORKS",
+    "own_cells": "cells.own_data.AGREEMENT",
+    "decoding": "cells.own_data.DECODING",
+    "own_cost": "cells.own_data.SCORING",
     "posterior": "cells.belief_rows.POSTERIOR_FIGURE",
     "alike_rooms": "cells.belief_rows.ROOMS_FIGURE",
     "kidnap": "cells.belief_rows.KIDNAP_FIGURE",
@@ -30,7 +33,8 @@ CELLS = {
     "lesions": "cells.belief_lesions.LESIONS_FIGURE",
     "scale": "cells.belief_lesions.SCALE_FIGURE",
 }
-"""Pose cells: the first nine are measured on `backend: classic`, the others on `backend: recall`."""
+"""Pose cells: the first nine are measured on `backend: classic`, three on simulated cells of an animal, the
+others on `backend: recall`."""
 REAL = {
     name: f"whiskers.{name}.FIGURE"
     for name in ("contact", "drift", "fit", "likeness", "walk", "create", "bumps")

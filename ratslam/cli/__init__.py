@@ -14,7 +14,7 @@ from importlib.metadata import entry_points
 from types import FrameType
 
 # Only the imports of argparse are made here, so that `--help` does not wait for JAX and NumPy.
-from ratslam.cli import doctor, live, maps, run, tools
+from ratslam.cli import cells, doctor, live, maps, run, tools
 from ratslam.cli.common import INPUT_ERROR, INTERRUPTED, TERMINATED, Commands
 from robot.drivers.processes import postpone_interrupt
 from tactile.base.errors import InputError, printable, tell
@@ -22,7 +22,7 @@ from tactile.base.files import FULL
 
 COMMANDS = (
     run.add_run, live.add_commands, maps.add_localise, maps.add_merge, maps.add_map, maps.add_path,
-    run.add_look, doctor.add_commands, tools.add_export, tools.add_check, tools.add_tools,
+    run.add_look, doctor.add_commands, cells.add_cells, tools.add_export, tools.add_check, tools.add_tools,
 )  # fmt: skip
 """The commands that are always there, in the order of the help."""
 INSTALLED = "ratslam.commands"

@@ -134,6 +134,24 @@ def positive_integer(text: str) -> int:
     return int(text)
 
 
+def positive_rate(text: str) -> float:
+    """Argument type of a rate in Hz."""
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0 < rate < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number above 0")
+    return rate
+
+
+def count_from_zero(text: str) -> int:
+    """Argument type of a seed, or of a number that may be 0."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} must be an integer from 0 on")
+    return int(text)
+
+
 class _ListConfigs(argparse.Action):
     """Prints the packaged configurations and ends the program."""
 

@@ -13,7 +13,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ratslam.cli.common import Commands, add_set, positive_integer, prepare_jax
+from ratslam.cli.common import (
+    Commands,
+    add_set,
+    count_from_zero,
+    positive_integer,
+    positive_rate,
+    prepare_jax,
+)
 from ratslam.runs.settings import SCHEMA_START
 from tactile.base.errors import tell
 from tactile.base.files import make_new_file, require_new_file, write_text_atomically
@@ -150,12 +157,12 @@ def add_check(commands: Commands) -> None:
     robot.add_path("-o", "DIR", "write page.txt, rig.yaml and bench.json to a new folder")
     robot.add_argument(
         "--turned-deg",
-        type=_positive_number,
+        type=positive_rate,
         metavar="DEG",
         help="create: true amount of the first turn, degrees",
     )
     robot.add_argument(
-        "--drove-m", type=_positive_number, metavar="M", help="create: true way of the first drive, m"
+        "--drove-m", type=positive_rate, metavar="M", help="create: true way of the first drive, m"
     )
     add_set(robot)
     source, touch = kinds.parsers["source"], kinds.parsers["touch"]
@@ -213,7 +220,7 @@ def _check_robot(arguments: argparse.Namespace) -> int:
         with suppress(EOFError):
             while text := input(question).strip():
                 with suppress(argparse.ArgumentTypeError):
-                    return _positive_number(text)
+                    return positive_rate(text)
         return None
 
     marks = {"turned_deg": arguments.turned_deg, "drove_m": arguments.drove_m}
@@ -240,14 +247,26 @@ def add_export(commands: Commands) -> None:
         "without a suffix becomes a ROS 2 bag folder", required=True,
     )  # fmt: skip
     export.add_argument(
-        "--peak-rate", type=_positive_number, default=20.0, metavar="HZ",
+        "--peak-rate", type=positive_rate, default=20.0, metavar="HZ",
         help="cells: rate of a cell at the peak of a settled packet (default 20 Hz)",
     )  # fmt: skip
-    export.add_argument("--spike-seed", type=_seed, default=0, metavar="N", help="spikes: seed (default 0)")
+    export.add_argument(
+        "--spike-seed", type=count_from_zero, default=0, metavar="N", help="spikes: seed (default 0)"
+    )
+    export.add_argument(
+        "--shuffles", type=count_from_zero, default=100, metavar="N",
+        help="scores of cells: shuffled controls of each (default 100; 0: none)",
+    )  # fmt: skip
+    export.add_argument(
+        "--about", action="append", default=[], metavar="KEY=VALUE",
+        help="NWB: subject_id, species, sex, age, start, description, experimenter, lab or institution; may "
+        "be repeated",
+    )  # fmt: skip
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from ratslam.service.export_formats import export_run
+    from ratslam.runs.settings.strict_yaml import override, parse, validate
+    from ratslam.service.export_formats import NwbMetadata, export_run
     from ratslam.service.spikes import SpikeConfig
 
     export_run(
@@ -255,23 +274,7 @@ def _export(arguments: argparse.Namespace) -> None:
         arguments.output,
         lambda text: tell(f"warning: {text}"),
         SpikeConfig(peak_rate=arguments.peak_rate, seed=arguments.spike_seed),
+        validate(override(parse("{}", "--about"), arguments.about), NwbMetadata),
+        arguments.shuffles,
     )
     print(f"{arguments.output}: written")
-
-
-def _positive_number(text: str) -> float:
-    """Argument type of a number above 0."""
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = 0.0
-    if not 0 < rate < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} must be a number above 0")
-    return rate
-
-
-def _seed(text: str) -> int:
-    """Argument type of a seed."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} must be an integer from 0 on")
-    return int(text)

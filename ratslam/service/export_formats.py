@@ -11,14 +11,16 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
+from pydantic import field_validator
 
 from evaluation.artifacts.grid_files import read_grid, write_nav2
-from evaluation.cells.analysis import analyse_cells, write_scores
+from evaluation.cells.analysis import analyse_cells, control_scores, write_scores
 from evaluation.cells.recording import NAME, CellRecording, read_recording
+from evaluation.cells.shuffling import ShuffledScores
 from ratslam.classic.config import NetworkConfig, network_of
 from ratslam.core.compilation import prepare_precision
 from ratslam.mapping.pose_graph import read_json
@@ -32,25 +34,67 @@ from ratslam.service.spikes import (
     settled_peak,
     write_spikes,
 )
+from robot.recordings.sanity_checks import utc_seconds
 from robot.sources.input_files import digest_of
 from tactile.base.errors import InputError
 from tactile.base.files import make_new_file, new_folder, require_new_file
 from tactile.base.se2 import wrap
+from tactile.base.settings import Settings
 
+MADE = "spikes simulated from the activity of pose cells of a RatSLAM network"
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-"""The start of every session. Times in the file are those of the source in s: dates are right if the source
-counts from 1970, and unknown otherwise."""
+"""The start of a session whose start is not given. Times in the file are those of the source in s: dates are
+right if the source counts from 1970, and unknown otherwise."""
 TRUE_FRAME = "world frame of the source; x forward at heading 0, y left of it"
 TORUS_FRAME = "torus of pose cells: x and y in 0 to {side:g} m, where they begin again"
 HEADING_FRAME = "counter-clockwise from the x axis, rad"
 TRUE_NAMES, PACKET_NAMES = ("Position", "CompassDirection"), ("PacketPosition", "PacketDirection")
 
 
-def write_nwb(path: Path, recording: CellRecording, spikes: SpikeTrains, digest: str) -> None:
+class NwbMetadata(Settings):
+    """What an NWB file says about its session, beside what the run knows."""
+
+    subject_id: str = ""
+    """Id of the subject; empty: the file has none."""
+    species: str = ""
+    """Of the subject, as `Rattus norvegicus`."""
+    sex: Literal["M", "F", "U", "O", ""] = ""
+    """Of the subject."""
+    age: str = ""
+    """Of the subject, an ISO duration: `P90D`."""
+    start: str = ""
+    """Start of the session, an ISO time, without an offset that of UTC; empty: 1970."""
+    description: str = ""
+    """Of the session, in front of what the program says."""
+    experimenter: str = ""
+    """Who recorded it."""
+    lab: str = ""
+    """Where."""
+    institution: str = ""
+    """Where."""
+
+    @field_validator("start")
+    @classmethod
+    def _check_start(cls, text: str) -> str:
+        if text:
+            try:
+                utc_seconds(text)
+            except ValueError:
+                raise ValueError(f"{text!r} is no ISO time such as 2024-05-01T10:00:00+02:00") from None
+        return text
+
+
+def write_nwb(
+    path: Path,
+    recording: CellRecording,
+    spikes: SpikeTrains,
+    digest: str,
+    about: NwbMetadata | None = None,
+) -> None:
     """Writes the spikes and the behaviour of a recording as an NWB file.
 
-    Equal input gives equal bytes with the same versions of pynwb and HDF5: dates are `EPOCH`, and the ids of
-    objects follow from the digest and their place in the file.
+    Equal input gives equal bytes with the same versions of pynwb and HDF5: the start is `EPOCH` unless it is
+    given, and the ids of objects follow from the digest and their place in the file.
 
     Contents: `units`: spike times of each cell, its index and its pose on the torus, and the interval in
     which spikes were drawn. `processing/behavior`: `Position` and `CompassDirection` of the true pose (NaN
@@ -59,7 +103,7 @@ def write_nwb(path: Path, recording: CellRecording, spikes: SpikeTrains, digest:
 
     Args:
         path: of the new file; an existing one is replaced. spikes: of the recording. digest: identifies the
-            recording and the settings.
+            recording and the settings. about: subject, start and description.
 
     Raises:
         InputError: pynwb is not installed, or the spikes are not of the cells of the recording.
@@ -72,12 +116,23 @@ def write_nwb(path: Path, recording: CellRecording, spikes: SpikeTrains, digest:
         raise InputError("export", "pynwb is not installed", "the extra 'nwb'", cure) from None
     if not np.array_equal(recording.cell, spikes.cell):
         raise InputError("spikes", "other cells than those of the recording", "the spikes of the recording")
+    about = about or NwbMetadata()
+    if about != NwbMetadata():
+        digest = digest_of([digest.encode(), about.model_dump_json().encode()])
+    own = {"subject_id": about.subject_id, "species": about.species, "sex": about.sex, "age": about.age}
+    place = {"lab": about.lab, "institution": about.institution, "experimenter": about.experimenter}
+    start = datetime.fromtimestamp(utc_seconds(about.start), UTC) if about.start else EPOCH
+    drawn = spikes.config
     file = pynwb.NWBFile(
-        session_description="spikes simulated from the activity of pose cells of a RatSLAM network",
+        session_description=". ".join(filter(None, [about.description, MADE])),
         identifier=digest,
-        session_start_time=EPOCH,
+        session_start_time=start,
         file_create_date=EPOCH,
+        notes=f"Poisson spikes, peak rate {drawn.peak_rate:g} Hz, seed {drawn.seed}",
+        **{key: value for key, value in place.items() if value},
     )
+    if any(own.values()):
+        file.subject = pynwb.file.Subject(**{key: value for key, value in own.items() if value})
     module = file.create_processing_module("behavior", "true pose of the robot and decoded packet")
     torus = TORUS_FRAME.format(side=recording.torus_sides[0])
     true = np.asarray(recording.truth, float)
@@ -121,6 +176,7 @@ def _add_units(file: Any, recording: CellRecording, spikes: SpikeTrains) -> None
     }
     for name, text in columns.items():
         file.add_unit_column(name, text)
+    file.units.description = f"simulated; {file.notes}"
     poses = cell_poses(recording.shape, recording.cell_size, recording.cell)
     for cell, times, pose in zip(spikes.cell.tolist(), spikes.times, poses.tolist(), strict=True):
         row = dict(zip(("x", "y", "heading"), pose, strict=True))
@@ -151,14 +207,20 @@ FORMATS = (
 
 
 def export_run(
-    directory: Path, output: Path, warn: Warn = lambda sentence: None, spikes: SpikeConfig | None = None
+    directory: Path,
+    output: Path,
+    warn: Warn = lambda sentence: None,
+    spikes: SpikeConfig | None = None,
+    about: NwbMetadata | None = None,
+    shuffles: int = 100,
 ) -> None:
     """Writes the results of a run to a new file, whole or not at all.
 
     Args:
         directory: of the run. output: its suffix chooses the format; without one, the folder of a ROS 2 bag.
         warn: called with a sentence about parts that the file lacks. spikes: of the recorded cells in .nwb
-            and .npz files; its peak rate is also that of the scores in a .csv file.
+            and .npz files; its peak rate is also that of the scores in a .csv file. about: what an .nwb file
+            says about the session. shuffles: controls of each cell in a .csv file.
 
     Raises:
         InputError: the run lacks what the format holds, a file of it is malformed, the output exists or its
@@ -200,14 +262,29 @@ def export_run(
             write_nav2(output.parent, grid, output.stem)
         case ".nwb":
             cells = read_run_cells(directory, config)
-            make_new_file(output, lambda path: write_nwb(path, *cells))
+            make_new_file(output, lambda path: write_nwb(path, *cells, about))
         case ".npz":
             _, drawn, _ = read_run_cells(directory, config)
             make_new_file(output, lambda path: write_spikes(path, drawn))
         case ".csv":
             recording, network = _read_cells(directory)  # of all cells, if only sums were recorded
             scores = analyse_cells(recording, config.peak_rate / settled_peak(network))
-            make_new_file(output, lambda path: write_scores(path, scores))
+            controls = _controls_of(recording, shuffles, config.seed, warn) if shuffles else None
+            make_new_file(output, lambda path: write_scores(path, scores, controls))
+
+
+def _controls_of(
+    recording: CellRecording, shuffles: int, seed: int, warn: Warn
+) -> dict[str, ShuffledScores] | None:
+    """The shuffled controls of the scores; None if there can be none, which is told."""
+    if not len(recording.cell):
+        warn("only sums were recorded, so that no score has shuffled controls; choose cells for them")
+        return None
+    try:
+        return control_scores(recording, shuffles, seed)
+    except InputError as error:
+        warn(f"no score has shuffled controls: {error}")
+        return None
 
 
 def _write_tum(directory: Path, output: Path, warn: Warn) -> None:

@@ -79,12 +79,14 @@ class SpikeTrains(NamedTuple):
     Attributes:
         cell: [C] int32 indices in the flattened network. times: for each cell the times [n] of its spikes,
             ascending, s on the clock of the recording. start, stop: s, the time in which spikes were drawn.
+        config: the peak rate and the seed with which they were drawn.
     """
 
     cell: np.ndarray
     times: list[np.ndarray]
     start: float
     stop: float
+    config: SpikeConfig
 
 
 def draw_spikes(recording: CellRecording, reference: float, config: SpikeConfig | None = None) -> SpikeTrains:
@@ -108,7 +110,7 @@ def draw_spikes(recording: CellRecording, reference: float, config: SpikeConfig 
         row = np.searchsorted(integral, arrivals, side="right") - 1
         share = (arrivals - integral[row]) / (integral[row + 1] - integral[row])
         times.append(np.minimum(time[row] + share * (time[row + 1] - time[row]), time[row + 1]))
-    return SpikeTrains(np.asarray(recording.cell, np.int32), times, float(time[0]), float(time[-1]))
+    return SpikeTrains(np.asarray(recording.cell, np.int32), times, float(time[0]), float(time[-1]), config)
 
 
 def expected_spikes(recording: CellRecording, reference: float, peak_rate: float) -> np.ndarray:
@@ -149,13 +151,15 @@ def write_spikes(path: str | Path, spikes: SpikeTrains) -> None:
     """Writes an .npz file; equal spikes give equal bytes.
 
     Arrays: `cell` [C] int32, `count` [C] spikes of each cell, `times` [sum of count] s, those of the first
-    cell first, `interval` [2] start and stop, s.
+    cell first, `interval` [2] start and stop, s, `peak_rate` Hz and `seed`.
     """
     arrays = {
         "cell": spikes.cell,
         "count": np.array([len(times) for times in spikes.times], np.int64),
         "times": np.concatenate([np.zeros(0), *spikes.times]),
         "interval": np.array([spikes.start, spikes.stop]),
+        "peak_rate": np.array(spikes.config.peak_rate),
+        "seed": np.array(spikes.config.seed),
     }
     with Path(path).open("wb") as file:  # with a path, NumPy would add a suffix to .NPZ
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
@@ -168,13 +172,16 @@ def read_spikes(path: str | Path) -> SpikeTrains:
         InputError: the file is missing or malformed.
     """
 
-    def parse(cell: np.ndarray, count: np.ndarray, times: np.ndarray, interval: np.ndarray) -> SpikeTrains:
+    def parse(cell: np.ndarray, count: np.ndarray, times: np.ndarray, *rest: np.ndarray) -> SpikeTrains:
+        interval, rate, seed = rest
         if cell.shape != count.shape or count.sum() != len(times) or interval.shape != (2,):
             raise ValueError("arrays that do not fit each other")
         parts = np.split(times, np.cumsum(count)[:-1])
-        return SpikeTrains(cell, parts, float(interval[0]), float(interval[1]))
+        config = SpikeConfig(peak_rate=float(rate), seed=int(seed))
+        return SpikeTrains(cell, parts, float(interval[0]), float(interval[1]), config)
 
-    return read_npz(path, ("cell", "count", "times", "interval"), parse, "a file of spikes")
+    names = ("cell", "count", "times", "interval", "peak_rate", "seed")
+    return read_npz(path, names, parse, "a file of spikes")
 
 
 SETTLING = 60

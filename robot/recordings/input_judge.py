@@ -255,6 +255,27 @@ class _Steps:
         return _outliers(self.length / self._share, 0.0) | _outliers(self.turn / self._share, LEAST_TURN)
 
 
+def tracker_faults(track: MotionTrack) -> tuple[np.ndarray, np.ndarray]:
+    """[N] bool twice, of the places of a tracked animal: those between a jump away and the jump back, within
+    `LEAST_GAP` s (a reflection, another mark); and those to which a jump leads that has no way back."""
+    steps = _Steps(track.time, track.motion)
+    place = np.cumsum(track.motion[:, :2], axis=0)
+    jumped = np.flatnonzero(steps.jumps())
+    wild, moved = np.zeros(len(place), bool), np.zeros(len(place), bool)
+    for row in jumped.tolist():
+        if wild[row - 1]:  # the way back
+            continue
+        later = jumped[(jumped > row) & (track.time[jumped] <= track.time[row] + LEAST_GAP)]
+        most = JUMP * steps.typical_length
+        elapsed = np.maximum((track.time[later] - track.time[row - 1]) / (steps.interval or 1.0), 1.0)
+        back = later[np.hypot(*(place[later] - place[row - 1]).T) <= most * elapsed]
+        if len(back):
+            wild[row : back[0]] = True
+        else:
+            moved[row] = True
+    return wild, moved
+
+
 def _outliers(amounts: np.ndarray, least: float) -> np.ndarray:
     """[N] bool, amounts over `JUMP` times the typical one of all smaller ones; none if they are many."""
     order = np.argsort(amounts)

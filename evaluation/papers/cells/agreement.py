@@ -53,21 +53,32 @@ def compare_scores(task: Task, seconds: float = SECONDS) -> list[tuple[str, str,
     Raises:
         InputError: a package is not installed.
     """
-    opexebo, pynapple = _load_package("opexebo"), _load_package("pynapple")
     count = task.sessions or CELLS
     recording = record_rat("rat", count, seconds=seconds, seed=task.first)
     rates = recording.activity * float(np.prod(recording.shape))
     edges = rate_map.arena_edges(recording.truth, 20)
-    sums = rate_map.bin_activity(recording.time, recording.truth, rates, *edges, 36)
+    return compare_sums(rate_map.bin_activity(recording.time, recording.truth, rates, *edges, 36))
+
+
+def compare_sums(sums: BinnedSums) -> list[tuple[str, str, int, float, float]]:
+    """The scores of cells from their sums, rates in Hz, as `compare_scores` gives them."""
+    opexebo, pynapple = load_package("opexebo"), load_package("pynapple")
     with quiet():
         pairs = [*_beside_opexebo(opexebo, sums), *_beside_pynapple(pynapple, sums)]
-    found = []
-    for score, package, mine, theirs in pairs:
-        apart = np.abs(mine - theirs)[~(np.isnan(mine) & np.isnan(theirs))]
-        difference = float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))
-        largest = float(np.nanmax(np.abs(mine))) if np.isfinite(mine).any() else np.nan
-        found.append((score, package, len(mine), difference, largest))
-    return found
+    return [(score, package, *difference_of(mine, theirs)) for score, package, mine, theirs in pairs]
+
+
+def difference_of(mine: np.ndarray, theirs: np.ndarray) -> tuple[int, float, float]:
+    """Number of values, largest difference (infinite where only one is undefined), and largest value of
+    ours.
+
+    Args:
+        mine, theirs: of equal shape, any unit, NaN where undefined.
+    """
+    apart = np.abs(mine - theirs)[~(np.isnan(mine) & np.isnan(theirs))]
+    difference = float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))
+    largest = float(np.nanmax(np.abs(mine))) if np.isfinite(mine).any() else np.nan
+    return len(mine), difference, largest
 
 
 def _agreement_table(result: list[tuple[str, str, int, float, float]]) -> list[str]:
@@ -128,11 +139,15 @@ def _numbers(values: Iterator[Any]) -> np.ndarray:
 
 FIGURE = Figure("Agreement with other packages", compare_scores, _agreement_table, None)
 
-HOW = {"opexebo": "pip install --no-deps opexebo", "pynapple": "pip install pynapple"}
+HOW = {
+    "opexebo": "pip install --no-deps opexebo",
+    "pynapple": "pip install pynapple",
+    "ratinabox.utils": "pip install 'ratslam[ratinabox]'",
+}
 """How each package is installed."""
 
 
-def _load_package(name: str) -> ModuleType:
+def load_package(name: str) -> ModuleType:
     """A package of `HOW`.
 
     Raises:

@@ -15,10 +15,10 @@ from evaluation.cells.head_direction import mean_vector_length, rayleigh_p
 from evaluation.cells.information import information, information_rate
 from evaluation.cells.rate_map import rate_maps, tuning_curves
 from evaluation.cells.recording import CellRecording
-from evaluation.cells.shuffling import shuffled_scores
+from evaluation.cells.shuffling import path_bins, shuffled_scores
 from evaluation.papers.cells.panels import time_call
 from evaluation.papers.cells.rat_sessions import SECONDS, record_rat
-from evaluation.papers.cells.shuffles import PLACE_SCORES, path_bins
+from evaluation.papers.cells.shuffles import PLACE_SCORES
 from evaluation.papers.figure import Figure
 from evaluation.papers.tables.markdown import table_lines
 from evaluation.studies.cell_study import cell_study, score_task, tasks_of
@@ -49,7 +49,7 @@ def measure_analysis(
     bins, score = path_bins(recording, "place"), PLACE_SCORES["grid score"]
     sums = recording._replace(cell=recording.cell[:0], activity=recording.activity[:, :0])
     calls = partial(_map_and_tune, recording), partial(analyse_cells, sums)
-    with _on_one_core() as found:
+    with on_one_core() as found:
         repeats = [[time_call(call) for call in calls] for _ in range(ROUNDS)]
         times = np.median(repeats, axis=0).tolist()
         times.append(time_call(partial(shuffled_scores, recording.activity, bins, score, shuffles, seed)))
@@ -106,7 +106,7 @@ def measure_networks(sets: int = MEASURED, steps: int = STEPS) -> tuple[str, Tim
         and of the goal, min, and the most memory of the process meanwhile, MB.
     """
     rows: Times = []
-    with _on_one_core() as found:
+    with on_one_core() as found:
         for name in GOALS:
             own = [f"views={str(name == 'with views').lower()}", f"steps={steps}", f"sets={sets}"]
             own += [f"rat_simulation.seconds={steps / 50}", "rat_simulation.rate_hz=50", "seed=0"]
@@ -150,7 +150,7 @@ NETWORKS = Figure(
 
 
 @contextmanager
-def _on_one_core() -> Iterator[list[str]]:
+def on_one_core() -> Iterator[list[str]]:
     """Keeps the process on its idlest core; after the block the list has one sentence on machine and load."""
     found, load = list[str](), watch_load()
     with one_core():

@@ -20,7 +20,7 @@ from evaluation.cells.information import (
     sparsity,
 )
 from evaluation.cells.recording import CellRecording
-from evaluation.cells.shuffling import Calibration, PathBins, Score, calibrate, shuffled_scores
+from evaluation.cells.shuffling import Calibration, Score, calibrate, path_bins, shuffled_scores
 from evaluation.papers.cells.rat_sessions import SECONDS, Way, record_rat
 from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import table_lines
@@ -122,18 +122,3 @@ SCORES: Mapping[str, Mapping[str, Score]] = {
 }
 """The scores of each kind of bins: tuning curves of 36, and maps of 8 headings and 10 x 10, are not
 smoothed."""
-
-
-def path_bins(recording: CellRecording, kind: str) -> PathBins:
-    """The bin of each step by a kind of `SCORES`: of place, 20 x 20 over the box that the path fills; of
-    heading, 36; or of both, 8 x 10 x 10."""
-    turns, across = (8, 10) if kind == "joint" else (36, 20)
-    seconds = rate_map.sample_seconds(recording.time)
-    place = rate_map.place_index(recording.truth, *rate_map.arena_edges(recording.truth, across))
-    heading = rate_map.heading_index(recording.truth, turns)
-    if kind == "place":
-        return PathBins(place, (across, across), seconds)
-    if kind == "heading":
-        return PathBins(heading, (turns,), seconds)
-    both = np.where((place < 0) | (heading < 0), -1, heading * across**2 + place)
-    return PathBins(both, (turns, across, across), seconds)

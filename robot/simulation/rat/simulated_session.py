@@ -16,6 +16,8 @@ import numpy as np
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from robot.recordings.csv_file import read_csv
+from robot.recordings.input_judge import heading_errors
+from robot.recordings.nwb_file import ANIMAL, NwbConfig, read_nwb
 from robot.recordings.sanity_checks import RowName
 from robot.simulation.rat.box import BoxConfig, ViewConfig, panoramic_views
 from robot.simulation.rat.phases import PhaseConfig, lay_out_phases
@@ -63,9 +65,11 @@ class PathFileConfig(MotionConfig):
     """A recorded path."""
 
     file: Path = Path("sargolini")
-    """`sargolini` (600 s in 1 x 1 m), `tanni` (1200 s in 3.5 x 2.5 m), or a file: `.csv` with columns t, x
-    and y, or `.npz` with t [N] and pos [N, 2]; s and m, with integers in ms and mm. The origin is a corner of
-    the box."""
+    """`sargolini` (600 s in 1 x 1 m), `tanni` (1200 s in 3.5 x 2.5 m), or a file: `.csv` with columns t, x, y
+    and, if it was measured, heading; `.npz` with t [N] and pos [N, 2]; s, m and rad, with integers in ms and
+    mm; or `.nwb`. The origin is a corner of the box."""
+    nwb: NwbConfig = NwbConfig()
+    """Series of an `.nwb` file; a measured head direction is the heading."""
     unit: PositiveFloat = 1.0
     """Length of the unit of positions, m: 0.01 for cm."""
     shift: tuple[float, float] = (0.0, 0.0)
@@ -89,10 +93,20 @@ def read_path(config: PathFileConfig) -> RatPath:
     place: RowName
     if file.suffix == ".csv":
         table = read_csv(file)
+        measured = ["heading"] if "heading" in table.names else []
         raise_errors(table.absences([(name, "") for name in ("t", "x", "y")]))
-        raise_errors(table.judge(["t", "x", "y"])[1])
+        raise_errors(table.judge(["t", "x", "y", *measured])[1])
         position = np.column_stack([table.column(name, "length") for name in ("x", "y")])
-        path, place = RatPath(table.column("t", "time"), position), table.place
+        time, heading = table.column("t", "time"), table.column("heading", "angle") if measured else None
+        if heading is not None:
+            raise_errors(heading_errors(heading, time, "the heading", str(file), ANIMAL))
+        path, place = RatPath(time, position, heading), table.place
+    elif file.suffix == ".nwb":
+        session, place = read_nwb(file, config.nwb), partial("{}, known sample {}".format, file)
+        known = np.isfinite(session.position).all(axis=1)
+        known &= True if session.heading is None else np.isfinite(session.heading)
+        heading = None if session.heading is None else session.heading[known]
+        path = RatPath(session.time[known], session.position[known], heading)
     else:
         path = read_npz(file, ("t", "pos"), _parse_arrays, "a path: arrays t [N] and pos [N, 2]")
         place = partial("{}:{}".format, file)
@@ -103,7 +117,8 @@ def read_path(config: PathFileConfig) -> RatPath:
         found = f"{config.skip:g} s to skip"
         expected = f"less than the duration of {file.name}, {path.time[-1] - path.time[0]:.4g} s"
         raise InputError("rat_simulation.path.skip", found, expected)
-    return RatPath(path.time[kept], path.position[kept])
+    heading = None if path.heading is None else path.heading[kept]
+    return RatPath(path.time[kept], path.position[kept], heading)
 
 
 def _parse_arrays(time: np.ndarray, position: np.ndarray) -> RatPath:
