@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -162,7 +163,7 @@ def control_scores(recording: CellRecording, shuffles: int = 100, seed: int = 0)
         bins = path_bins(recording, kind)
         if kind == "speed" and not bins.seconds[bins.flat >= 0].sum() > 0:
             continue  # no speed is known
-        each = shuffled_scores(recording.activity, bins, _SCORES[kind], shuffles, seed)
+        each = shuffled_scores(recording.activity, bins, partial(_score_bins, kind), shuffles, seed)
         for k, name in enumerate(names):
             found[name] = ShuffledScores(each.score[k], each.shuffled[:, k])
     return found
@@ -177,28 +178,22 @@ CONTROLLED = {
 value of the Rayleigh test is itself one."""
 CORRECTED = ("information", "heading_information")
 """Scores that grow with the scatter of few spikes, of which the mean of shuffles is taken off."""
+LOWER = ("sparsity",)
+"""Scores that tuning makes smaller: the 5th percentile of their shuffles is the limit."""
 
 
-def _place_scores(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """[k, n] the scores of maps without smoothing."""
+def _score_bins(kind: str, rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """[k, n] the scores of a kind of `CONTROLLED` of rates per bin without smoothing."""
+    if kind == "speed":
+        return speed_score(rates, seconds)[None]
     visited = np.where(seconds >= LEAST_SECONDS, 1.0, np.nan)
+    if kind == "heading":
+        turn = rates * visited, seconds
+        return np.array([head_direction.mean_vector_length(*turn), information(*turn)])
     maps = smooth_rates(rates, seconds, 1.5) * visited
     images, place = autocorrelogram(maps), (maps, seconds)
     scores = information(*place), sparsity(*place), selectivity(*place), coherence(rates * visited, seconds)
     return np.array([*scores, border_score(*place), lattice_scores(images), lattice_scores(images, SQUARE)])
-
-
-def _heading_scores(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """[k, n] the scores of tuning curves."""
-    turn = np.where(seconds >= LEAST_SECONDS, rates, np.nan), seconds
-    return np.array([head_direction.mean_vector_length(*turn), information(*turn)])
-
-
-_SCORES = {
-    "place": _place_scores,
-    "heading": _heading_scores,
-    "speed": lambda rates, seconds: speed_score(rates, seconds)[None],
-}
 
 
 def write_scores(
@@ -212,7 +207,8 @@ def write_scores(
 
     Args:
         controls: `control_scores` of the cells, as columns behind the score: `NAME_shuffled`, the mean of the
-            shuffles, `NAME_p95`, their 95th percentile, and `NAME_corrected`, an information minus that mean.
+            shuffles, `NAME_p95`, their 95th percentile (`NAME_p05` of one that tuning makes smaller), and
+            `NAME_corrected`, an information minus that mean.
             None: without them. names: of the cells, instead of their indices.
     """
     columns: dict[str, list[object]] = {}
@@ -221,7 +217,10 @@ def write_scores(
         if controls is not None and name in controls:
             control = controls[name]
             columns[f"{name}_shuffled"] = control.mean.tolist()
-            columns[f"{name}_p95"] = control.percentile.tolist()
+            if name in LOWER:
+                columns[f"{name}_p05"] = control.low_percentile.tolist()
+            else:
+                columns[f"{name}_p95"] = control.percentile.tolist()
             if name in CORRECTED:
                 columns[f"{name}_corrected"] = control.corrected.tolist()
 

@@ -76,7 +76,7 @@ def smooth_plane(values: np.ndarray, sigma: float, squared: bool = False) -> np.
     The value beside a wall is repeated outside (d c b a | a b c d), so no activity leaves the box. NaN
     spread; smooth `numpy.nan_to_num(values)` and the mask of visited bins and divide to ignore them.
     """
-    height, width = (_kernel(bins, sigma) for bins in values.shape[-2:])
+    height, width = _kernel(values.shape[-2], sigma), _kernel(values.shape[-1], sigma)
     return height**2 @ values @ width.T**2 if squared else height @ values @ width.T
 
 

@@ -76,6 +76,11 @@ class ShuffledScores(NamedTuple):
         return np.where(count >= _FEWEST, below + (rank - low) * (above - below), np.nan)
 
     @property
+    def low_percentile(self) -> np.ndarray:
+        """5th percentile of the shuffles of each cell: [C], at rank 0.05 (S + 1); NaN as `percentile`."""
+        return -ShuffledScores(-self.score, -self.shuffled).percentile
+
+    @property
     def mean(self) -> np.ndarray:
         """Mean score of the shuffles of each cell: [C], over those that have one; NaN where none has."""
         known = np.isfinite(self.shuffled)

@@ -53,6 +53,8 @@ def add_cells(commands: Commands) -> None:
         "--peak-rate", type=positive_rate, default=20.0, metavar="HZ",
         help="rate of a cell of the run at the peak of a settled packet (default 20 Hz)",
     )  # fmt: skip
+    help = "spikes from which a cell is compared (default 50)"
+    compare.add_argument("--least", type=positive_integer, default=50, metavar="N", help=help)
     help = "seed of spikes, shuffles and intervals (default 0)"
     compare.add_argument("--seed", type=count_from_zero, default=0, metavar="N", help=help)
 
@@ -93,7 +95,7 @@ def _compare(arguments: argparse.Namespace) -> None:
 
     spikes = SpikeConfig(peak_rate=arguments.peak_rate, seed=arguments.seed)
     own = arguments.run, arguments.data, _series(arguments.set), _warn, arguments.turn
-    described, rows = compare_run(*own, spikes, arguments.shuffles)
+    described, rows = compare_run(*own, spikes, arguments.shuffles, arguments.least)
     table = list(comparison_table(rows))
     widths = [max(len(row[k]) for row in table) for k in range(len(table[0]))]
     print(described)

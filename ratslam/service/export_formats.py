@@ -174,9 +174,11 @@ def _add_units(file: Any, recording: CellRecording, spikes: SpikeTrains) -> None
         "y": "of the cell on the torus, m",
         "heading": "of the cell, rad",
     }
+    import pynwb.misc
+
+    file.units = pynwb.misc.Units(name="units", description=f"simulated; {file.notes}")
     for name, text in columns.items():
         file.add_unit_column(name, text)
-    file.units.description = f"simulated; {file.notes}"
     poses = cell_poses(recording.shape, recording.cell_size, recording.cell)
     for cell, times, pose in zip(spikes.cell.tolist(), spikes.times, poses.tolist(), strict=True):
         row = dict(zip(("x", "y", "heading"), pose, strict=True))

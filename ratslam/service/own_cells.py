@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.cells.analysis import analyse_cells, control_scores, write_scores
-from evaluation.cells.comparison import Interval, Row, compare_cells
+from evaluation.cells.cell_comparison import LEAST_SPIKES, Interval, Row, compare_cells
 from evaluation.cells.rate_map import running_speed
 from evaluation.cells.recording import CellRecording, record_spikes
 from ratslam.runs.settings.run_config import load_config
@@ -105,6 +105,7 @@ def compare_run(
     turn: float | None = None,
     spikes: SpikeConfig | None = None,
     shuffles: int = 100,
+    least: int = LEAST_SPIKES,
 ) -> tuple[str, list[Row]]:
     """The cells of a run beside those of an NWB file; both in words, and the lines of the comparison.
 
@@ -114,6 +115,7 @@ def compare_run(
     Args:
         directory: of a run with chosen cells. turn: when cues turned in the data, s; None: not at all.
         spikes: of the run's cells; its seed is also that of shuffles and bootstrap. shuffles: of each cell.
+        least: spikes of a cell that is compared.
 
     Raises:
         InputError: as `read_run_cells`, `read_own_cells` and `compare_cells`.
@@ -125,7 +127,7 @@ def compare_run(
     phases = () if simulation is None else simulation.phases
     turned = next((phase.start for phase in phases if phase.rotate_cues_deg), None)
     cells = read_own_cells(path, config, warn)
-    rows = compare_cells(model, cells.recording, (turned, turn), shuffles, seed=spikes.seed)
+    rows = compare_cells(model, cells.recording, (turned, turn), shuffles, least, seed=spikes.seed)
     described = f"model {directory}: {len(trains.cell)} cells, {sum(map(len, trains.times))} spikes, "
     seconds = recording.time[-1] - recording.time[0]
     described += f"{seconds:.0f} s, peak rate {spikes.peak_rate:g} Hz, seed {spikes.seed}"

@@ -169,9 +169,11 @@ class _Series:
         known = np.flatnonzero(np.isfinite(angle) & np.isfinite(clock))
         if len(known) < 2:
             raise InputError(where, f"{len(known)} head directions", "two at least")
-        near = np.abs(time - clock[known][_nearest(clock[known], time)])
-        found = wrap(np.interp(time, clock[known], np.unwrap(angle[known])))
-        return np.where(near <= GAP * np.median(np.diff(clock[known])), found, np.nan)
+        clock, angle = clock[known], angle[known]
+        after = np.clip(np.searchsorted(clock, time), 1, len(clock) - 1)
+        near = np.minimum(np.abs(time - clock[after - 1]), np.abs(clock[after] - time))
+        found = wrap(np.interp(time, clock, np.unwrap(angle)))
+        return np.where(near <= GAP * np.median(np.diff(clock)), found, np.nan)
 
     def _only(self, found: dict[str, Any], name: str, key: str, container: str) -> Any:
         """The series of a name, with or without its container; without a name the only one, or None."""
@@ -211,12 +213,6 @@ class _Series:
         return 1 / factor
 
 
-def _nearest(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """[M] index of the time in a clock [N] nearest to each time [M]; N is at least 2."""
-    after = np.clip(np.searchsorted(clock, time), 1, len(clock) - 1)
-    return after - (time - clock[after - 1] <= clock[after] - time)
-
-
 def _units(path: Path, file: Any) -> tuple[tuple[str, ...], list[np.ndarray], np.ndarray | None]:
     """Names, spike times and common intervals of the units of a file, which may have none."""
     units = file.units
@@ -234,16 +230,14 @@ def _units(path: Path, file: Any) -> tuple[tuple[str, ...], list[np.ndarray], np
     common: np.ndarray | None = None
     for number in range(len(units)):
         own = np.asarray(units.get_unit_obs_intervals(number), np.float64).reshape(-1, 2)
-        if len(own):
-            common = own if common is None else _intersection(common, own)
+        if not len(own):
+            continue
+        if common is not None:  # the times in both lists
+            first = np.maximum.outer(common[:, 0], own[:, 0]).ravel()
+            last = np.minimum.outer(common[:, 1], own[:, 1]).ravel()
+            own = np.column_stack([first, last])[first < last]
+        common = own
     return names, spikes, common
-
-
-def _intersection(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """[K, 2] the times in both of two lists of intervals [M, 2] and [N, 2]."""
-    first = np.maximum.outer(one[:, 0], other[:, 0]).ravel()
-    last = np.minimum.outer(one[:, 1], other[:, 1]).ravel()
-    return np.column_stack([first, last])[first < last]
 
 
 def _judge(path: Path, time: np.ndarray, position: np.ndarray, warn: Warn) -> np.ndarray:

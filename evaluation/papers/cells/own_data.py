@@ -23,7 +23,6 @@ from evaluation.papers.cells.costs import on_one_core
 from evaluation.papers.cells.panels import time_call
 from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import table_lines
-from evaluation.studies.executor import run_tasks
 from ratslam.service.own_cells import read_own_cells
 from robot.simulation.rat.simulated_session import RandomWalkConfig, RatSimulation, RatSimulationConfig
 from tactile.base.random_streams import stream
@@ -130,7 +129,9 @@ def _maps(
         whole = nap.IntervalSet(position.t[0] - 0.5 / RATE, position.t[-1] + 0.5 / RATE)
         keys: dict[str, Any] = {"epochs": whole, "fs": RATE}
         place = nap.compute_tuning_curves(units, position, bins=[EDGES, EDGES], **keys)
-        turned = nap.Tsd(t=heading.t, d=(np.asarray(heading.d) + np.pi / 36) % (2 * np.pi))  # its bins begin at 0
+        turned = nap.Tsd(
+            t=heading.t, d=(np.asarray(heading.d) + np.pi / 36) % (2 * np.pi)
+        )  # its bins begin at 0
         turn = nap.compute_tuning_curves(units, turned, bins=[np.linspace(0, 2 * np.pi, 37)], **keys)
     seen = place.attrs["occupancy"]
     yield "seconds in a bin", "pynapple", sums.seconds, seen.T / RATE
@@ -185,14 +186,13 @@ def decode_sessions(task: Task, seconds: float = SECONDS) -> list[tuple[float, f
     Args:
         seconds: of a session.
     """
-    return list(run_tasks(partial(_decode, seconds), list(task.seeds(SEEDS)), task.workers))
-
-
-def _decode(seconds: float, seed: int) -> tuple[float, float, np.ndarray]:
-    cells = record_spikes(*draw_session(DECODED, seed, seconds, sharpness=0.0))
-    found = decode_positions(cells, window=WINDOW, bins=BINS, smoothing=SMOOTHING, seed=seed)
-    apart = np.unique(found.time // APART, return_index=True)[1]
-    return found.median, float(np.median(found.control)), found.level[apart]
+    results = []
+    for seed in task.seeds(SEEDS):
+        cells = record_spikes(*draw_session(DECODED, seed, seconds, sharpness=0.0))
+        found = decode_positions(cells, window=WINDOW, bins=BINS, smoothing=SMOOTHING, seed=seed)
+        apart = np.unique(found.time // APART, return_index=True)[1]
+        results.append((found.median, float(np.median(found.control)), found.level[apart]))
+    return results
 
 
 def _table_decoding(result: list[tuple[float, float, np.ndarray]]) -> list[str]:
@@ -237,17 +237,16 @@ def measure_scoring(task: Task, seconds: float = SECONDS, shuffles: int = SHUFFL
                 "all scores": partial(analyse_cells, cells),
                 "all controls": partial(control_scores, cells, shuffles),
             }
-            times = [(name, *time_call(call)) for name, call in calls.items()]
+            times = [(name, *(f"{taken:.1f}" for taken in time_call(call))) for name, call in calls.items()]
     note = (
         f"{count} units, a session of {seconds:.0f} s at {RATE:g} Hz, {shuffles} shuffles of each. {found[0]}"
     )
     return note, times
 
 
-def _table_scoring(result: tuple[str, list[Any]]) -> list[str]:
-    note, times = result
-    rows = ((name, f"{processor:.1f}", f"{wall:.1f}") for name, processor, wall in times)
-    return table_lines([note], ("part", "processor s", "wall s"), rows)
-
-
-SCORING = Figure("What scoring one's own cells costs", measure_scoring, _table_scoring, None)
+SCORING = Figure(
+    "What scoring one's own cells costs",
+    measure_scoring,
+    lambda result: table_lines([result[0]], ("part", "processor s", "wall s"), result[1]),
+    None,
+)

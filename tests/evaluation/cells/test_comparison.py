@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from evaluation.cells.analysis import CONTROLLED, analyse_cells, control_scores, speed_score, write_scores
-from evaluation.cells.comparison import Row, compare_cells
+from evaluation.cells.cell_comparison import Row, compare_cells
 from evaluation.cells.decoding import decode_positions
 from evaluation.cells.rate_map import running_speed
 from evaluation.cells.recording import CellRecording, record_spikes
@@ -138,8 +138,8 @@ def test_cells_of_one_kind_are_alike_and_other_tuning_is_found_on_its_side() -> 
     assert difference[1] > 0  # m², without 0 in the interval
     assert rows["field_area"].above[1] > 0.5
     assert (
-        rows["vector_length, share above shuffles"].model[0]
-        > rows["vector_length, share above shuffles"].data[2]
+        rows["vector_length, share beyond shuffles"].model[0]
+        > rows["vector_length, share beyond shuffles"].data[2]
     )
     same = by_score(
         compare_cells(

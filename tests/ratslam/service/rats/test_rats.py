@@ -274,10 +274,12 @@ def test_files_hold_all_and_equal_spikes_give_equal_bytes_and_a_damaged_one_is_r
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     read = read_spikes(tmp_path / "a.npz")
     np.testing.assert_array_equal(read.cell, [9, 4, 200])
-    assert (read.start, read.stop) == (spikes.start, spikes.stop)
+    assert read[2:] == spikes[2:]  # the time in which they were drawn, their rate and their seed
     for one, other in zip(read.times, spikes.times, strict=True):
         np.testing.assert_array_equal(one, other)
-    np.savez(tmp_path / "other.npz", cell=np.zeros(2), count=np.zeros(3), times=[], interval=[0.0, 1.0])
+    drawn = {"peak_rate": 20.0, "seed": 3}
+    other = {"cell": np.zeros(2), "count": np.zeros(3), "times": [], "interval": [0.0, 1.0]} | drawn
+    np.savez(tmp_path / "other.npz", **other)
     with pytest.raises(InputError, match="do not fit each other"):
         read_spikes(tmp_path / "other.npz")
 

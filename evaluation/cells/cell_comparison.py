@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evaluation.cells.analysis import CONTROLLED, CORRECTED, analyse_cells, control_scores
+from evaluation.cells.analysis import CONTROLLED, CORRECTED, LOWER, analyse_cells, control_scores
 from evaluation.cells.head_direction import mean_vector_length, preferred_direction
 from evaluation.cells.rate_map import arena_edges, bin_activity, correlate, rate_maps, tuning_curves
 from evaluation.cells.recording import BinnedSums, CellRecording
@@ -20,11 +20,11 @@ from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 
 LEAST_SPIKES = 50
-"""Spikes from which a cell is scored."""
+"""Spikes from which a cell is compared, unless another number is given."""
 TURNS = np.radians(np.arange(0, 360, 10))
 """Turns of maps that are tried."""
-PLAIN = ("mean_rate", "sparsity", "selectivity", "coherence", "field_area", "fields")
-"""Scores that are compared as they are; the others against their shuffles."""
+PLAIN = ("mean_rate", "field_area", "fields")
+"""Scores that are compared as they are; the others beside their shuffles too."""
 TUNED = 0.3
 """Mean vector length, before and after cues turn, from which a preferred direction counts."""
 
@@ -57,29 +57,37 @@ def compare_cells(
     data: CellRecording,
     turns: tuple[float | None, float | None] = (None, None),
     shuffles: int = 100,
+    least: int = LEAST_SPIKES,
     draws: int = 1000,
     seed: int = 0,
 ) -> list[Row]:
     """Compares the cells of two recordings in spikes/s (`recording.record_spikes`).
 
-    Of each score the medians, of those with shuffled controls also the share of cells above the 95th
-    percentile of their shuffles. Information is without its bias (`ShuffledScores.corrected`).
+    Of each score the medians, of those with shuffled controls also the share of cells beyond the 95th
+    percentile of their shuffles (`analysis.LOWER`: below the 5th). Information is without its bias
+    (`ShuffledScores.corrected`).
 
     Args:
         turns: times at which cues turned in the model's session and in the data's, s on their clocks; None:
-            not at all. shuffles: of each cell. draws: of the bootstrap. seed: of shuffles and draws.
+            not at all. shuffles: of each cell. least: spikes of a cell that is compared. draws: of the
+            bootstrap. seed: of shuffles and draws.
 
     Raises:
-        InputError: no cell has `LEAST_SPIKES`, or a session is too short (`control_scores`).
+        InputError: no cell has so many spikes, or a session is too short (`control_scores`).
     """
-    sides = [_describe(each, turn, shuffles, seed) for each, turn in zip((model, data), turns, strict=True)]
+    sides = [
+        _describe(each, turn, shuffles, least, seed) for each, turn in zip((model, data), turns, strict=True)
+    ]
     nothing: tuple[_Statistic, np.ndarray] = np.median, np.zeros(0)
     rows = []
     for name in dict.fromkeys([*sides[0], *sides[1]]):
         statistic = next(side[name][0] for side in sides if name in side)
         values = [side.get(name, nothing)[1] for side in sides]
         random = stream(seed, f"comparison {name}")
-        drawn = [_bootstrap(each, statistic, draws, random) for each in values]
+        drawn = (
+            _bootstrap(values[0], statistic, draws, random),
+            _bootstrap(values[1], statistic, draws, random),
+        )
         apart = drawn[1] - drawn[0]
         above = np.full(draws + 1, np.nan)
         if statistic is np.median and all(map(len, values)):
@@ -98,14 +106,17 @@ def compare_cells(
     return rows
 
 
-def _describe(recording: CellRecording, turn: float | None, shuffles: int, seed: int) -> _Described:
+def _describe(
+    recording: CellRecording, turn: float | None, shuffles: int, least: int, seed: int
+) -> _Described:
     """What is compared of a recording."""
     step = np.diff(recording.time, prepend=recording.time[0])
     spikes = step @ recording.activity
-    kept = spikes >= LEAST_SPIKES
+    kept = spikes >= least
     if not kept.any():
         found = f"{len(spikes)} cells with at most {spikes.max(initial=0):.0f} spikes"
-        raise InputError("cells", found, f"a cell with {LEAST_SPIKES} spikes", "record longer")
+        cure = "record longer or more cells, raise --peak-rate of a model, or lower --least"
+        raise InputError("cells", found, f"a cell with {least} spikes", cure)
     chosen = recording._replace(cell=recording.cell[kept], activity=recording.activity[:, kept])
     scores = analyse_cells(chosen)._asdict()
     controls = control_scores(chosen, shuffles, seed)
@@ -114,7 +125,8 @@ def _describe(recording: CellRecording, turn: float | None, shuffles: int, seed:
         value = controls[name].corrected if name in CORRECTED else controls[name].score
         described[f"{name}, corrected" if name in CORRECTED else name] = np.median, value
         known = np.isfinite(controls[name].percentile)
-        described[f"{name}, share above shuffles"] = np.mean, controls[name].above[known].astype(float)
+        beyond = value < controls[name].low_percentile if name in LOWER else controls[name].above
+        described[f"{name}, share beyond shuffles"] = np.mean, beyond[known].astype(float)
     if turn is not None:
         described |= _turned(chosen, turn)
     return {
@@ -140,11 +152,12 @@ def _turned(recording: CellRecording, turn: float) -> _Described:
             time[part], np.column_stack([place, truth[part, 2]]), recording.activity[part], *edges
         )
 
-    halves = sums_of(early), sums_of(~early)
-    before, first = rate_maps(halves[0]), time < (time[early][0] + turn) / 2
+    halves, first = (sums_of(early), sums_of(~early)), time < (time[early][0] + turn) / 2
+    before = rate_maps(halves[0])
     alike = np.stack([correlate(before, rate_maps(sums_of(~early, angle))) for angle in TURNS], axis=1)
     best = _best_turn(alike[np.isfinite(alike).all(axis=1)])
     after = rate_maps(sums_of(~early, best))
+    other_cell = np.roll(after, 1, axis=0)
     curves = [(tuning_curves(half), half.heading_seconds) for half in halves]
     one, other = (preferred_direction(*each) for each in curves)
     tuned = np.minimum(*(np.nan_to_num(mean_vector_length(*each)) for each in curves)) >= TUNED
@@ -153,23 +166,18 @@ def _turned(recording: CellRecording, turn: float) -> _Described:
         "map correlation, halves of the time before": (np.median, correlate(*parts)),
         "map correlation, before and after": (np.median, alike[:, 0]),
         "map correlation, turned back by the best turn": (np.median, correlate(before, after)),
-        "map correlation, so turned, with another cell": (
-            np.median,
-            correlate(before, np.roll(after, 1, axis=0)),
-        ),
+        "map correlation, so turned, with another cell": (np.median, correlate(before, other_cell)),
         "best turn of maps, rad": (_best_turn, alike),
-        "turn of preferred directions, rad": (_mean_angle, wrap(other - one)[tuned]),
+        "turn of preferred directions, rad": (
+            lambda angle: float(np.angle(np.exp(1j * angle).sum())),
+            wrap(other - one)[tuned],
+        ),
     }
 
 
 def _best_turn(alike: np.ndarray) -> float:
     """The turn, rad in -pi to pi, with the largest median of the correlations [n, turns]."""
     return float(wrap(TURNS[np.argmax(np.median(alike, axis=0))])) if len(alike) else np.nan
-
-
-def _mean_angle(angle: np.ndarray) -> float:
-    """Circular mean [n], rad."""
-    return float(np.angle(np.exp(1j * angle).sum())) if len(angle) else np.nan
 
 
 def _bootstrap(
