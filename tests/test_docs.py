@@ -57,7 +57,7 @@ MARKED = {
     ),
     "data": (
         "doctor ", "fit ", "run mine", "run tuesday", "localise runs/monday", "merge runs/monday",
-        "tools recover", "tools convert", "pip ",
+        "tools recover", "tools convert", "pip ", "cells score rat", "cells compare runs/rat rat",
     ),
     "hours": ("study ", "size ", "reproduce ", "check ", "make "),
 }  # fmt: skip
@@ -67,7 +67,7 @@ REFUSED = {"python -m ratslam run square --continue runs/square -o runs/rest": "
 """What is refused, as its README says: that run was not interrupted."""
 SLOW = (
     "run create_arena", "run rat_box", "run whisker_maze", "simulate ", "export runs/rat", "timeit ",
-    "run square -o runs/seen",
+    "run square -o runs/seen", "cells score runs/rat", "cells compare runs/rat",
 )  # fmt: skip
 """Commands that take longest: for `make soak`."""
 

@@ -25,6 +25,7 @@ CELLS = {
     "networks": "cells.costs.NETWORKS",
     "own_cells": "cells.own_data.AGREEMENT",
     "decoding": "cells.own_data.DECODING",
+    "comparison": "cells.own_data.COMPARISON",
     "own_cost": "cells.own_data.SCORING",
     "posterior": "cells.belief_rows.POSTERIOR_FIGURE",
     "alike_rooms": "cells.belief_rows.ROOMS_FIGURE",
@@ -33,7 +34,7 @@ CELLS = {
     "lesions": "cells.belief_lesions.LESIONS_FIGURE",
     "scale": "cells.belief_lesions.SCALE_FIGURE",
 }
-"""Pose cells: the first nine are measured on `backend: classic`, three on simulated cells of an animal, the
+"""Pose cells: the first nine are measured on `backend: classic`, four on simulated cells of an animal, the
 others on `backend: recall`."""
 REAL = {
     name: f"whiskers.{name}.FIGURE"

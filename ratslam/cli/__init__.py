@@ -106,7 +106,7 @@ class Program(argparse.ArgumentParser):
     commands: Commands
 
     def format_help(self) -> str:
-        lines = ["usage: ratslam COMMAND ...", DESCRIPTION, ""]
+        lines = ["usage: ratslam COMMAND ...", DESCRIPTION]
         groups = dict.fromkeys([*GROUPS, *(parser.group for parser in self.commands.parsers.values())])
         for group in groups:
             heading = group

@@ -7,7 +7,7 @@ with has spikes. The file is written by pynwb alone, as a lab would, and read as
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 
 from evaluation.cells import rate_map
 from evaluation.cells.analysis import analyse_cells, control_scores
+from evaluation.cells.cell_comparison import compare_cells
 from evaluation.cells.decoding import decode_positions
 from evaluation.cells.recording import CellRecording, record_spikes
 from evaluation.papers.cells.agreement import GOAL, compare_sums, difference_of, load_package, quiet
@@ -44,13 +45,21 @@ class OwnSession(NamedTuple):
     spikes: list[np.ndarray]
 
 
-def draw_session(cells: int, seed: int, seconds: float = SECONDS, sharpness: float = SHARPNESS) -> OwnSession:
+def draw_session(
+    cells: int,
+    seed: int,
+    seconds: float = SECONDS,
+    sharpness: float = SHARPNESS,
+    wider: float = 1.0,
+    turn: float = 0.0,
+) -> OwnSession:
     """Poisson cells with a place field each on a random walk in a box of 1 m.
 
     Every other one has a preferred direction of the head, which wags about the direction of motion.
 
     Args:
-        sharpness: of the directions; 0: no cell has one.
+        sharpness: of the directions; 0: no cell has one. wider: factor of the width of the fields. turn: of
+            all fields and directions in the second half, round the middle of the box, rad.
     """
     walk = RatSimulation(
         RatSimulationConfig(walk=RandomWalkConfig(), seconds=seconds, rate_hz=RATE, seed=seed)
@@ -58,13 +67,16 @@ def draw_session(cells: int, seed: int, seconds: float = SECONDS, sharpness: flo
     draw = stream(seed, "own cells")
     wag = 0.4 * np.sin(2 * np.pi * 0.7 * walk.time)
     truth = np.column_stack([walk.truth[:, :2], wrap(walk.truth[:, 2] + wag)])
+    turned = np.where(np.arange(len(truth)) < len(truth) // 2, 0.0, turn)
+    cos, sin, (x, y) = np.cos(turned), np.sin(turned), (truth[:, :2] - 0.5).T
+    place, heading = np.column_stack([cos * x + sin * y, cos * y - sin * x]) + 0.5, truth[:, 2] - turned
     spikes = []
     for cell in range(cells):
-        apart = truth[:, :2] - draw.random(2)
-        rate = PEAK * np.exp(-(apart**2).sum(axis=1) / (2 * draw.uniform(*FIELD) ** 2))
+        apart = place - draw.random(2)
+        rate = PEAK * np.exp(-(apart**2).sum(axis=1) / (2 * (wider * draw.uniform(*FIELD)) ** 2))
         preferred = draw.uniform(-np.pi, np.pi)
         if cell % 2:
-            rate *= np.exp(sharpness * (np.cos(truth[:, 2] - preferred) - 1))
+            rate *= np.exp(sharpness * (np.cos(heading - preferred) - 1))
         count = draw.poisson(rate / RATE)
         times = np.repeat(walk.time, count) + draw.uniform(-0.5, 0.5, count.sum()) / RATE
         spikes.append(np.sort(times))
@@ -215,6 +227,66 @@ def _table_decoding(result: list[tuple[float, float, np.ndarray]]) -> list[str]:
 
 
 DECODING = Figure("Regions of the decoded place", decode_sessions, _table_decoding, None)
+
+COMPARED, PAIRS, PAIR_SHUFFLES = 40, 20, 20
+"""Cells of a session, pairs of sessions of a kind, and shuffles of each cell."""
+KINDS: Mapping[str, Mapping[str, float]] = {
+    "alike": {},
+    "fields 1.3 times as wide": {"wider": 1.3},
+    "cues turn by 90 degrees": {"turn": np.pi / 2},
+}
+"""How the second session of a pair differs from the first."""
+
+
+def compare_kinds(task: Task, seconds: float = SECONDS) -> list[tuple[str, str, float, float, float]]:
+    """What `compare_cells` says of pairs of sessions of known tuning: the kind, what is asked, the median of
+    the answers, the share of the pairs or scores whose answer is right, and the share that is expected, NaN
+    where that depends on the number of cells.
+
+    Args:
+        seconds: of a session.
+    """
+    found = []
+    for kind, changed in KINDS.items():
+        rows = []
+        for seed in task.seeds(PAIRS):
+            pair = (
+                record_spikes(*draw_session(COMPARED, seed, seconds)),
+                record_spikes(*draw_session(COMPARED, seed + 500, seconds, **changed)),
+            )
+            compared = compare_cells(*pair, (seconds / 2, seconds / 2), PAIR_SHUFFLES, draws=500, seed=seed)
+            rows.append({row.score: row for row in compared})
+        if kind == "alike":
+            each = [row.difference for pairs in rows for row in pairs.values()]
+            held = [low <= 0 <= high for _, low, high in each if np.isfinite(low)]
+            found.append((kind, "intervals of differences that hold 0", np.nan, float(np.mean(held)), 0.95))
+            continue
+        if "wider" in changed:
+            answers = [pairs["field_area"].difference for pairs in rows]
+            right = [low > 0 for _, low, _ in answers]
+            asked, expected = "field area, m², is larger beyond the interval", np.nan
+        else:
+            answers = [pairs["best turn of maps, rad"].difference for pairs in rows]
+            right = [low - 0.1 <= np.pi / 2 <= high + 0.1 for _, low, high in answers]
+            asked, expected = "turn of maps, rad, within 0.1 of the interval", 1.0
+        middle = float(np.median([first for first, *_ in answers]))
+        found.append((kind, asked, middle, float(np.mean(right)), expected))
+    return found
+
+
+def _table_comparison(result: list[tuple[str, str, float, float, float]]) -> list[str]:
+    note = (
+        f"Pairs of sessions of {COMPARED} Poisson cells of known tuning, {PAIR_SHUFFLES} shuffles of each; a "
+        "pair has two walks, two draws of cells and two of spikes. Intervals are over cells."
+    )
+    rows = []
+    for kind, asked, middle, *shares in result:
+        shown = ["-" if np.isnan(share) else f"{100 * share:.0f} %" for share in shares]
+        rows.append([kind, asked, "-" if np.isnan(middle) else f"{middle:.3g}", *shown])
+    return table_lines([note], ("second session", "asked", "median answer", "right", "expected"), rows)
+
+
+COMPARISON = Figure("Recorded cells beside others", compare_kinds, _table_comparison, None)
 
 COST_CELLS = 500
 
