@@ -92,7 +92,7 @@ def open_source(
     if config.create_simulation is not None:
         return CreateSimulation(config.create_simulation)
     if config.rat_simulation is not None:
-        return RatSimulation(config.rat_simulation)
+        return RatSimulation(config.rat_simulation, warn=_warning(report, warnings))
     if config.simulation is not None and config.simulation.touch == "force":
         return PokeSimulation(config.simulation, config.touch.pokes)
     if config.simulation is not None:

@@ -37,7 +37,7 @@ from robot.sources.in_memory import (
     wrap_headings,
 )
 from robot.sources.input_files import digest_of, raise_errors, require_file
-from robot.sources.source import SourceInfo
+from robot.sources.source import SourceInfo, Warn
 from tactile.base.bounded import read_npz
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
@@ -82,8 +82,11 @@ class PathFileConfig(MotionConfig):
         return self if str(self.file) in PACKAGED else super().resolved(folder, here, at)
 
 
-def read_path(config: PathFileConfig) -> RatPath:
+def read_path(config: PathFileConfig, warn: Warn = None) -> RatPath:
     """The path of a file, checked, with the settings for unit, shift and skipped time applied.
+
+    Args:
+        warn: called with one sentence for each fault of the tracker in an NWB file.
 
     Raises:
         InputError: the file cannot be read, or holds no path of a rat (`check_path`), with its row.
@@ -102,7 +105,7 @@ def read_path(config: PathFileConfig) -> RatPath:
             raise_errors(heading_errors(heading, time, "the heading", str(file), ANIMAL))
         path, place = RatPath(time, position, heading), table.place
     elif file.suffix == ".nwb":
-        session, place = read_nwb(file, config.nwb), partial("{}, known sample {}".format, file)
+        session, place = read_nwb(file, config.nwb, warn), partial("{}, known sample {}".format, file)
         known = np.isfinite(session.position).all(axis=1)
         known &= True if session.heading is None else np.isfinite(session.heading)
         heading = None if session.heading is None else session.heading[known]
@@ -256,6 +259,7 @@ class RatSimulation(SimulatedSource):
     Args:
         path: positions in the box, its south-west corner at the origin, instead of those that the
             configuration names: for example of an agent of another simulator. They are not smoothed.
+        warn: see `read_path`.
 
     Attributes:
         config: its settings. timeline: [N] phases. time: [N] s from 0. truth: [N, 3]. odometry: [N, 4].
@@ -267,10 +271,10 @@ class RatSimulation(SimulatedSource):
     name = "rat_simulation"
     whiskers = 0
 
-    def __init__(self, config: RatSimulationConfig, path: RatPath | None = None) -> None:
+    def __init__(self, config: RatSimulationConfig, path: RatPath | None = None, warn: Warn = None) -> None:
         self.config, self.rate_hz = config, config.rate_hz
         self.view_shape = (1, config.views.columns, 1)
-        pose = _poses_of(config, path)
+        pose = _poses_of(config, path, warn)
         rows = len(pose)
         if config.seconds is not None:
             rows = max(round(config.seconds * config.rate_hz), 1)
@@ -333,7 +337,7 @@ def _scale_poses(pose: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return np.column_stack([pose[:, :2] * scale, heading + wrap(turned - heading)])
 
 
-def _poses_of(config: RatSimulationConfig, path: RatPath | None) -> np.ndarray:
+def _poses_of(config: RatSimulationConfig, path: RatPath | None, warn: Warn) -> np.ndarray:
     """[L, 3] poses of the path in the first box, headings not wrapped."""
     rate, size, smoothing = config.rate_hz, (config.box.width, config.box.height), 0.0
     if path is not None:
@@ -344,7 +348,7 @@ def _poses_of(config: RatSimulationConfig, path: RatPath | None) -> np.ndarray:
         check_steps(where, seconds * rate)
         path = walk_randomly(config.walk, size, seconds, rate, config.seed)
     else:
-        where, path, smoothing = str(config.path.file), read_path(config.path), config.path.smoothing
+        where, path, smoothing = str(config.path.file), read_path(config.path, warn), config.path.smoothing
         check_steps(where, rate * (path.time[-1] - path.time[0]))
     return sample_path(_enter_box(path, size, where), config.path, rate, smoothing)
 

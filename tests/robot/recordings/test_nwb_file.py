@@ -142,6 +142,11 @@ def test_jumps_and_gaps_of_the_tracker_are_told_and_wild_places_are_unknown(
         in said[0]
     )
     assert "no position for 4.0 s in gaps, 10.1 % of the session" in said[1]
+    assert found.heading is None
+    told: list[str] = []
+    path = simulated.read_path(PathFileConfig(file=tmp_path / "a.nwb", max_gap=5.0), told.append)
+    assert told == said
+    assert len(path.time) == 896
     said.clear()
     place[:] = PLACE
     place[500:] += 1.5  # the box was moved
