@@ -28,6 +28,12 @@ PLAIN = ("mean_rate", "field_area", "fields")
 TUNED = 0.3
 """Mean vector length, before and after cues turn, from which a preferred direction counts."""
 
+UNITS = {
+    "mean_rate": "Hz", "field_area": "m²", "coherence": "z", "information, corrected": "bits/spike",
+    "heading_information, corrected": "bits/spike",
+}  # fmt: skip
+"""Of scores that have one."""
+
 Interval = tuple[float, float, float]
 """A statistic, and the ends of its interval; NaN where there are no cells."""
 _Statistic = Callable[[np.ndarray], float]
@@ -41,7 +47,8 @@ class Row(NamedTuple):
     Attributes:
         score: its name. cells: of the model and of the data that have it. model, data: the statistic of each.
             difference: data minus model; of angles on the circle. above: probability that a cell of the data
-            has more of it than one of the model (0.5: alike); NaN for shares and turns.
+            has more of it than one of the model (0.5: alike); NaN for shares and turns. values: of the cells
+            of the model and of the data, as far as known.
     """
 
     score: str
@@ -50,6 +57,12 @@ class Row(NamedTuple):
     data: Interval
     difference: Interval
     above: Interval
+    values: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def label(self) -> str:
+        """The name with its unit."""
+        return f"{self.score}, {UNITS[self.score]}" if self.score in UNITS else self.score
 
 
 def compare_cells(
@@ -101,6 +114,7 @@ def compare_cells(
                 _interval(drawn[1], is_angle),
                 _interval(apart, is_angle),
                 _interval(above),
+                (values[0], values[1]),
             )
         )
     return rows

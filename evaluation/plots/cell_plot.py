@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from evaluation.cells.cell_comparison import Row
 from evaluation.cells.information import information
 from evaluation.cells.rate_map import known_poses, rate_maps, recorded_sums, tuning_curves
 from evaluation.cells.recording import BinnedSums, CellRecording
@@ -114,4 +115,26 @@ def draw_spikes_on_path(
         axes.set(xticks=[], yticks=[], aspect="equal")
         label = f"cell {recording.cell[k]}, {len(times)} spike{'s' * (len(times) != 1)}"
         axes.set_title(label, fontsize=7, color=INK, pad=2)
+    return figure
+
+
+def draw_distributions(title: str, rows: Sequence[Row]) -> style.Figure:
+    """Draws the share of cells up to each value of a score, of the model and of the data, a panel for each
+    score; shares and turns have none."""
+    drawn = [row for row in rows if np.isfinite(row.above[0])]
+    columns, side, up = 4, 1.25, 1.75
+    top = style.TOP + 0.35
+    height = top + -(-len(drawn) // columns) * up
+    figure = style.new_figure(height, title, "share of cells up to a value, of the model and of the data")
+    width = (style.INNER - (columns - 1) * 0.5) / columns
+    for k, row in enumerate(drawn):
+        down, across = divmod(k, columns)
+        bottom = height - top - side - down * up
+        axes = style.add_axes(figure, style.LEFT + across * (width + 0.5), bottom, width, side)
+        axes.grid(color=style.LINE_GREY, lw=0.7)
+        for values, colour, label in zip(row.values, (BLUE, VERMILLION), ("model", "data"), strict=True):
+            axes.ecdf(values, color=colour, lw=1.3, label=label)
+        axes.set_title(f"{row.label}\nP(data > model) {row.above[0]:.2f}", fontsize=6.2, color=INK, pad=3)
+        if not k:
+            axes.legend(frameon=False, fontsize=7.5, labelcolor=INK)
     return figure

@@ -14,7 +14,7 @@ from ratslam.cli.common import (
     positive_rate,
     prepare_jax,
 )
-from tactile.base.errors import tell
+from tactile.base.errors import InputError, tell
 from tactile.base.files import make_new_file
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def add_cells(commands: Commands) -> None:
     )  # fmt: skip
     compare.add_path("run", "RUN", "the run directory, with recorded pose cells")
     _add_data(compare)
-    compare.add_path("-o", "CSV", "write the comparison to a new file too")
+    compare.add_path("-o", "FILE", "new file: .csv the comparison, .png the distributions of the scores")
     compare.add_argument(
         "--turn",
         type=float,
@@ -90,9 +90,13 @@ def _score(arguments: argparse.Namespace) -> None:
 
 def _compare(arguments: argparse.Namespace) -> None:
     prepare_jax()
+    from evaluation.plots.cell_plot import draw_distributions
     from ratslam.service.own_cells import compare_run, comparison_table
     from ratslam.service.spikes import SpikeConfig
 
+    output = arguments.output
+    if output is not None and output.suffix not in (".csv", ".png"):
+        raise InputError(str(output), f"an unknown suffix {output.suffix!r}", ".csv or .png")
     spikes = SpikeConfig(peak_rate=arguments.peak_rate, seed=arguments.seed)
     own = arguments.run, arguments.data, _series(arguments.set), _warn, arguments.turn
     described, rows = compare_run(*own, spikes, arguments.shuffles, arguments.least)
@@ -104,22 +108,21 @@ def _compare(arguments: argparse.Namespace) -> None:
     print(
         "medians, shares and turns, each with the 95 % interval of a bootstrap over cells, not over animals"
     )
-    if arguments.output is None:
+    if output is None:
         return
 
     def write(path: Path) -> None:
         with path.open("w", newline="", encoding="utf-8") as file:
-            names = "score", "cells_model", "cells_data"
-            parts = [
-                f"{part}{end}"
-                for part in ("model", "data", "difference", "above")
-                for end in ("", "_low", "_high")
-            ]
+            parts = ("model", "data", "difference", "above")
+            ends = [f"{part}{end}" for part in parts for end in ("", "_low", "_high")]
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow([*names, *parts])
-            writer.writerows(
-                [row.score, *row.cells, *(each for part in row[2:] for each in part)] for row in rows
-            )
+            writer.writerow(["score", "cells_model", "cells_data", *ends])
+            for row in rows:
+                numbers = row.model + row.data + row.difference + row.above
+                writer.writerow([row.score, *row.cells, *numbers])
 
-    make_new_file(arguments.output, write)
-    print(f"{arguments.output}: written")
+    figure = draw_distributions(f"{arguments.run.name} beside {arguments.data.name}", rows)
+    make_new_file(
+        output, write if output.suffix == ".csv" else lambda path: figure.savefig(path, format="png")
+    )
+    print(f"{output}: written")

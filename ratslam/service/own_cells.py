@@ -147,4 +147,4 @@ def comparison_table(rows: list[Row]) -> Iterator[tuple[str, ...]]:
     yield COLUMNS
     for row in rows:
         numbers = map(shown, (row.model, row.data, row.difference, row.above))
-        yield row.score, *numbers, f"{row.cells[0]}, {row.cells[1]}"
+        yield row.label, *numbers, f"{row.cells[0]}, {row.cells[1]}"

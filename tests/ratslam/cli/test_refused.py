@@ -284,7 +284,7 @@ def reads_a_path(parser: CommandParser) -> bool:
 @pytest.mark.parametrize("words", [key for key, one in PROGRAMS.items() if reads_a_path(one)], ids=" ".join)
 def test_a_path_that_is_not_there_is_an_error_of_every_command(words, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
-    new = "new.png" if words == ("path",) else "new.npz"
+    new = "new.png" if words in {("path",), ("cells", "compare")} else "new.npz"
     output = ["-o", new] if " -o" in PROGRAMS[words].format_help() else []
     assert "none.npz" in refused(capsys, *words, *more_arguments(words, "none.npz"), *output)
     assert list(tmp_path.iterdir()) == []

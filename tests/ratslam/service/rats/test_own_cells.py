@@ -126,6 +126,9 @@ def test_a_run_stands_beside_recorded_cells_with_intervals_and_its_cue_turn(
     turned = rows["turn of preferred directions, rad"]
     assert abs(float(turned["model"])) < 0.4
     assert abs(float(turned["data"])) < 0.4
+    said(capsys, *own, "-o", tmp_path / "c.png")
+    assert (tmp_path / "c.png").read_bytes()[:4] == b"\x89PNG"
+    assert ".csv or .png" in refused(capsys, *own, "-o", tmp_path / "c.txt")
     assert "cells.npz: no such file" in refused(capsys, "cells", "compare", tmp_path / "none", data)
 
 
