@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.special import gammaln, xlogy
+from scipy.stats import nbinom
 
 from evaluation.cells import sheet_phase
 from evaluation.cells.decoding import decode_positions, log_posterior, packet_drift, truth_in_sheet
@@ -65,6 +66,31 @@ def test_the_posterior_is_that_of_poisson_cells() -> None:
     assert np.isneginf(found[:, ~known]).all()
     difference = (found - each.sum(axis=1) - prior)[:, known]
     assert_allclose(difference, difference[:, :1] * np.ones(7), atol=1e-12)
+
+
+def test_rates_that_were_estimated_in_little_time_make_the_posterior_less_sure() -> None:
+    """Negative binomial counts; with much time those of Poisson cells."""
+    rates = stream(1, "rates").random((3, 2, 4)) * 9 + 0.1
+    counts, seconds = stream(1, "counts").poisson(1.5, (6, 3)), np.array([0.5, 0.5, 2.0, 0.5, 2.0, 1.0])
+    exposure, prior = np.full((2, 4), 3.0), np.zeros((2, 4))
+    shape = rates * 3 + 0.5
+    spent = 3 + 0.5 / rates.mean(axis=(1, 2), keepdims=True)
+    theirs = [
+        nbinom.logpmf(n[:, None, None], shape, spent / (spent + t)).sum(axis=0)
+        for n, t in zip(counts, seconds, strict=True)
+    ]
+    difference = (log_posterior(counts, seconds, rates, prior, exposure) - theirs).reshape(6, -1)
+    assert_allclose(difference, difference[:, :1] * np.ones(8), atol=1e-9)
+    known = log_posterior(counts, seconds, rates, prior)
+    long = log_posterior(counts, seconds, rates, prior, exposure * 1e7)
+    assert_allclose(long - long[:, :1, :1], known - known[:, :1, :1], atol=1e-4)
+
+    def entropy(logs: np.ndarray) -> np.ndarray:
+        share = np.exp(logs - logs.max(axis=(1, 2), keepdims=True)).reshape(len(logs), -1)
+        share /= share.sum(axis=1, keepdims=True)
+        return -xlogy(share, share).sum(axis=1)
+
+    assert entropy(log_posterior(counts, seconds, rates, prior, exposure / 10)).mean() > entropy(known).mean()
 
 
 def test_drift_is_followed_beyond_the_torus_and_unfit_recordings_are_refused() -> None:

@@ -4,6 +4,8 @@ import re
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from evaluation.metrics.trajectory import ate
 from robot.recordings import input_judge as judging
@@ -16,6 +18,7 @@ from robot.recordings.mcap_writer import record_source
 from robot.recordings.npz_trace import read_trace
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import Stretch
+from robot.simulation.rat.simulated_session import PathFileConfig, read_path
 from robot.sources.odometry import OdometryCorrection, from_poses, from_velocities, replace_steps
 from tactile.base.errors import InputError, InputErrors
 from tactile.base.se2 import between, integrate
@@ -373,3 +376,20 @@ def test_a_stretch_without_samples_is_refused():
     assert Stretch(1.0, 3.0).rows(time, "a").tolist() == [False, True, True, True, False]
     with pytest.raises(InputError, match="nothing from"):
         Stretch(5.0).rows(time, "a")
+
+
+@given(st.integers(0, 10**6))
+def test_all_and_only_the_places_between_a_jump_away_and_back_are_wild(seed):
+    """On the path of a real rat, with reflections of up to three samples."""
+    path, draw = read_path(PathFileConfig()), np.random.default_rng(seed)
+    assert len(path.time) == 5960
+    place, bad = path.position.copy(), np.zeros(5960, bool)
+    for at in draw.choice(np.arange(5, 5940, 10), draw.integers(0, 30), replace=False).tolist():
+        angle, rows = draw.uniform(0, 2 * np.pi), slice(at, at + draw.integers(1, 4))
+        place[rows] += draw.uniform(0.5, 2) * np.array([np.cos(angle), np.sin(angle)])
+        bad[rows] = True
+    steps = np.diff(place, axis=0, prepend=place[:1])
+    motion = np.column_stack([steps, np.zeros(5960), np.diff(path.time, prepend=path.time[:1])])
+    wild, moved = judging.tracker_faults(MotionTrack(path.time, np.ones(5960, bool), motion))
+    assert (wild == bad).all()
+    assert not moved.any()

@@ -76,6 +76,8 @@ def test_units_are_scored_as_cells_of_a_network_each_score_beside_its_control(
         np.testing.assert_array_equal(
             limit, control.low_percentile if name == "sparsity" else control.percentile
         )
+    two = refused(capsys, "cells", "score", data, "-o", tmp_path / "t.csv", "--set", "leds=[front, back]")
+    assert "no series 'front'; expected it among 'position'" in two
     assert [row["cell"] for row in rows] == [str(number) for number in range(12)]
     assert "exists already" in refused(capsys, "cells", "score", data, "-o", tmp_path / "s.csv")
     assert "data.nw: no such file" in refused(
