@@ -19,7 +19,7 @@ import numpy as np
 
 from evaluation.cells import head_direction
 from evaluation.cells.fields import border_score, find_fields
-from evaluation.cells.grid_score import SQUARE, autocorrelogram, lattice_scores
+from evaluation.cells.grid_score import HEXAGONAL, SQUARE, autocorrelogram, score_lattices
 from evaluation.cells.information import information, information_rate, mean_rate, selectivity, sparsity
 from evaluation.cells.rate_map import (
     LEAST_SECONDS,
@@ -96,7 +96,7 @@ def analyse_cells(recording: CellRecording, gain: float | None = None) -> CellSc
     if any(recording.shape):
         sheet = np.array(np.unravel_index(cell, recording.shape), float)
     heading, row, column = sheet
-    images = autocorrelogram(rates)
+    lattice = score_lattices(autocorrelogram(rates), LATTICES)
     speed = np.full(len(cell), np.nan)
     if len(recording.cell):
         at = path_bins(recording, "speed")
@@ -121,8 +121,8 @@ def analyse_cells(recording: CellRecording, gain: float | None = None) -> CellSc
         fields=fields.number,
         field_area=fields.largest * bin_area,
         border=border_score(*place),
-        grid=lattice_scores(images),
-        square=lattice_scores(images, SQUARE),
+        grid=lattice[0],
+        square=lattice[1],
         vector_length=head_direction.mean_vector_length(*turn),
         direction=head_direction.preferred_direction(*turn),
         heading_peak=head_direction.peak_rate(*turn),
@@ -176,6 +176,8 @@ CONTROLLED = {
 }
 """The scores with a control by the bins that they need. The number and size of fields have ties, and the p
 value of the Rayleigh test is itself one."""
+LATTICES = HEXAGONAL, SQUARE
+"""Of the scores `grid` and `square`."""
 CORRECTED = ("information", "heading_information")
 """Scores that grow with the scatter of few spikes, of which the mean of shuffles is taken off."""
 LOWER = ("sparsity",)
@@ -193,7 +195,7 @@ def _score_bins(kind: str, rates: np.ndarray, seconds: np.ndarray) -> np.ndarray
     maps = smooth_rates(rates, seconds, 1.5) * visited
     images, place = autocorrelogram(maps), (maps, seconds)
     scores = information(*place), sparsity(*place), selectivity(*place), coherence(rates * visited, seconds)
-    return np.array([*scores, border_score(*place), lattice_scores(images), lattice_scores(images, SQUARE)])
+    return np.array([*scores, border_score(*place), *score_lattices(images, LATTICES)])
 
 
 def write_scores(

@@ -144,7 +144,7 @@ def _describe(
     if turn is not None:
         described |= _turned(chosen, turn)
     return {
-        name: (statistic, values[np.isfinite(values.reshape(len(values), -1)).all(axis=1)])
+        name: (statistic, values[np.isfinite(values).all(axis=tuple(range(1, values.ndim)))])
         for name, (statistic, values) in described.items()
     }
 
@@ -170,7 +170,7 @@ def _turned(recording: CellRecording, turn: float) -> _Described:
     before = rate_maps(halves[0])
     alike = np.stack([correlate(before, rate_maps(sums_of(~early, angle))) for angle in TURNS], axis=1)
     best = _best_turn(alike[np.isfinite(alike).all(axis=1)])
-    after = rate_maps(sums_of(~early, best))
+    after = rate_maps(sums_of(~early, 0.0 if np.isnan(best) else best))
     other_cell = np.roll(after, 1, axis=0)
     curves = [(tuning_curves(half), half.heading_seconds) for half in halves]
     one, other = (preferred_direction(*each) for each in curves)

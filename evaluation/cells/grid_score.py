@@ -9,6 +9,7 @@ score is the best mean over three successive radii (Langston et al. 2010, Scienc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -245,13 +246,18 @@ class _Annuli(NamedTuple):
 
 
 def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -> np.ndarray:
-    """Lattice scores of autocorrelograms: [n], between -2 and 2.
+    """Lattice scores of autocorrelograms: [n], between -2 and 2; see `score_lattices`."""
+    return score_lattices(autocorrelograms, (lattice,))[0]
+
+
+def score_lattices(autocorrelograms: np.ndarray, lattices: Sequence[Lattice]) -> np.ndarray:
+    """Scores of autocorrelograms for each of k symmetries: [k, n], between -2 and 2.
 
     The score is NaN where a map is flat, has no central field of at least 5 bins, or has no annulus between
     this field and the edge. Lags that are NaN inside the annuli count as 0, no correlation.
 
     Args:
-        autocorrelograms: [n, h, w] as from `autocorrelogram`, odd sides. lattice: its symmetry.
+        autocorrelograms: [n, h, w] as from `autocorrelogram`, odd sides. lattices: the symmetries.
 
     Raises:
         InputError: the array is no batch of maps with odd sides.
@@ -261,12 +267,13 @@ def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -
         found = f"array of shape {list(maps.shape)}"
         raise InputError("autocorrelograms", found, "maps [n, h, w] with odd sides")
     batches = [maps[i : i + _SCORED_AT_ONCE] for i in range(0, len(maps), _SCORED_AT_ONCE)]
-    return np.concatenate([_score_batch(batch, lattice) for batch in batches] or [np.empty(0)])
+    scored = [_score_batch(batch, lattices) for batch in batches]
+    return np.concatenate(scored or [np.empty((len(lattices), 0))], axis=1)
 
 
-def _score_batch(maps: np.ndarray, lattice: Lattice) -> np.ndarray:
-    """Scores [n] of a batch [n, h, w] that fits the cache."""
-    scores = np.full(len(maps), np.nan)
+def _score_batch(maps: np.ndarray, lattices: Sequence[Lattice]) -> np.ndarray:
+    """Scores [k, n] of a batch [n, h, w] that fits the cache."""
+    scores = np.full((len(lattices), len(maps)), np.nan)
     height, width = maps.shape[1:]
     (valid,) = np.nonzero(maps[:, height // 2, width // 2] > 0)
     stacked = np.ascontiguousarray(np.nan_to_num(maps[valid]).transpose(1, 2, 0))
@@ -276,8 +283,9 @@ def _score_batch(maps: np.ndarray, lattice: Lattice) -> np.ndarray:
     found = (inner > 0) & (inner < outer)
     if not found.any():
         return scores
-    curves = _curves(stacked[..., found].reshape(height * width, -1), inner[found], lattice, height, width)
-    scores[valid[found]] = _best(curves, inner[found])
+    flat = stacked[..., found].reshape(height * width, -1)
+    for k, lattice in enumerate(lattices):
+        scores[k, valid[found]] = _best(_curves(flat, inner[found], lattice, height, width), inner[found])
     return scores
 
 
