@@ -42,8 +42,9 @@ class CellRecording(NamedTuple):
     """The activity of cells over the T steps of a session.
 
     Attributes:
-        shape: (K, N, N) cells of the network over heading, y, x; (0, 0, 0) of cells of an animal, whose
-            activity is in spikes/s (`record_spikes`). cell_size: side of a cell, m.
+        shape: (K, N, N) cells of the network over heading, y, x; of a twisted sheet of grid cells fewer over
+            y; (0, 0, 0) of cells of an animal, whose activity is in spikes/s (`record_spikes`). cell_size:
+            side of a cell, m.
         time: [T] s. truth: [T, 3] true pose, m, m, rad, NaN where unknown. packet: [T, 3] decoded pose over
             x, y, heading, cells. energy: [T] injected by views; of a belief its total. place: [T] int32 id of
             the place or view template, -1 for none.
@@ -71,9 +72,13 @@ class CellRecording(NamedTuple):
 
     @property
     def torus_sides(self) -> tuple[float, float, float]:
-        """Periods of the torus over x, y (m) and heading (rad)."""
+        """Periods of the torus over x, y (m) and heading (rad).
+
+        A sheet with fewer rows than columns is twisted (`ratslam.network.grid_cells`): a turn along y shifts
+        x by half a turn, so that two of them are a period.
+        """
         _, height, width = self.shape
-        return width * self.cell_size, height * self.cell_size, 2 * np.pi
+        return width * self.cell_size, height * self.cell_size * (1 + (height < width)), 2 * np.pi
 
 
 def record_spikes(

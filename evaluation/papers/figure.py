@@ -19,6 +19,7 @@ CELLS = {
     "rotation": "cells.rotation.FIGURE",
     "boxes": "cells.boxes.FIGURE",
     "torus": "cells.torus.FIGURE",
+    "sheets": "cells.sheets.FIGURE",
     "analysis_cost": "cells.costs.ANALYSIS",
     "agreement": "cells.agreement.FIGURE",
     "shuffles": "cells.shuffles.FIGURE",
@@ -31,6 +32,7 @@ CELLS = {
     "alike_rooms": "cells.belief_rows.ROOMS_FIGURE",
     "kidnap": "cells.belief_rows.KIDNAP_FIGURE",
     "cue_conflict": "cells.belief_rows.CONFLICT_FIGURE",
+    "theta": "cells.theta.FIGURE",
     "lesions": "cells.belief_lesions.LESIONS_FIGURE",
     "scale": "cells.belief_lesions.SCALE_FIGURE",
 }

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Discriminator, Field, PositiveFloat, PositiveInt, Tag, field_validator
 
-from ratslam.network.config import PoseCellConfig
+from ratslam.network.config import PoseCellConfig, SheetConfig
 from tactile.base.settings import Settings
 
 CellIndex = Annotated[int, Field(ge=0)]
@@ -51,6 +51,8 @@ class CellsConfig(Settings):
     `session.seed`; or the indices x, y, heading of each."""
     sums: CellSumsConfig | None = None
     """Sums of the activity of all cells; null: none."""
+    sheet: SheetConfig | None = None
+    """With `backend: recall`: record grid cells that read the belief instead of the pose cells; null: not."""
 
 
 Width = Annotated[int, Field(ge=3, le=15)]

@@ -161,6 +161,7 @@ def add_run(commands: Commands) -> None:
     )  # fmt: skip
     run.add_flag("--full", "print all figures, as `score` does")
     run.add_flag("--report", "write map_results.html, a page, to the run directory")
+    run.add_path("--movie", "GIF", "animate the belief of `backend: recall`", check=require_new_file)
     add_rerun(run)
 
     simulate = commands.add(
@@ -205,13 +206,17 @@ def _run(arguments: argparse.Namespace) -> int:
     from ratslam.runs import map_results
     from ratslam.runs.localise import describe_localisation
     from ratslam.runs.run import run
+    from ratslam.service.belief_movie import BeliefMovie, write_movie
     from ratslam.service.viewer_link import open_viewer
 
     if arguments.report:
         map_results.check_report_libraries("--report")
     directory, config, target = run_directory(arguments), read_config(arguments), open_target(arguments)
+    movies = [BeliefMovie(arguments.movie, config.backend)] if arguments.movie else []
     with open_viewer(target) as observers:
-        card, interrupted = run(config, directory, arguments.resume, observers)
+        card, interrupted = run(config, directory, arguments.resume, [*observers, *movies])
+    for movie in movies:
+        write_movie(arguments.movie, directory.name, movie.frames)
     if arguments.full:
         print(f"{_render_scores(directory, card)}\n")
     print(f"{directory}/map.png shows the map, {directory}/trajectory.tum holds the trajectory")

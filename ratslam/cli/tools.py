@@ -254,6 +254,11 @@ def add_export(commands: Commands) -> None:
         "--spike-seed", type=count_from_zero, default=0, metavar="N", help="spikes: seed (default 0)"
     )
     export.add_argument(
+        "--theta", type=positive_rate, default=0.0, metavar="HZ",
+        help="spikes: in each of so many cycles a second one cell, drawn by its activity, fires for all "
+        "(default: all fire by their activity at all times)",
+    )  # fmt: skip
+    export.add_argument(
         "--shuffles", type=count_from_zero, default=100, metavar="N",
         help="scores of cells: shuffled controls of each (default 100; 0: none)",
     )  # fmt: skip
@@ -273,7 +278,7 @@ def _export(arguments: argparse.Namespace) -> None:
         arguments.run,
         arguments.output,
         lambda text: tell(f"warning: {text}"),
-        SpikeConfig(peak_rate=arguments.peak_rate, seed=arguments.spike_seed),
+        SpikeConfig(peak_rate=arguments.peak_rate, seed=arguments.spike_seed, theta_hz=arguments.theta),
         validate(override(parse("{}", "--about"), arguments.about), NwbMetadata),
         arguments.shuffles,
     )

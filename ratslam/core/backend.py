@@ -50,8 +50,8 @@ class PoseCellProbe(NamedTuple):
     """What can be recorded of the pose cells of a method.
 
     Attributes:
-        shape: (K, N, N) cells over heading, y, x; of a network that grows, those that it begins with.
-            cell_size: side of a cell, m.
+        shape: (K, N, N) cells over heading, y, x; of a network that grows, those that it begins with; of a
+            twisted sheet fewer over y. cell_size: side of a cell, m.
         each: pure function of the state and of the indices [C] of cells in the flattened network to their
             activity [C], float32. hold: pure function of the state to what `active` needs.
         active: indices [n] of the active cells and their activity [n], float32, of what was held; on the
@@ -248,6 +248,14 @@ class Backend(Protocol):
 
     def probe(self) -> PoseCellProbe | None:
         """What can be recorded of the pose cells, of a method that has them."""
+        return None
+
+    def sheet_probe(self, sheet: Any) -> PoseCellProbe | None:
+        """What can be recorded of grid cells that read the belief, of a method that has one.
+
+        Args:
+            sheet: a `ratslam.network.config.SheetConfig`.
+        """
         return None
 
     def new_map(self) -> Map:

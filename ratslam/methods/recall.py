@@ -36,8 +36,8 @@ from ratslam.mapping.map import KeyframeMap
 from ratslam.mapping.map_state import MapState
 from ratslam.mapping.pieces import piece_start
 from ratslam.methods.config import RecallBackendConfig
-from ratslam.network import pose_cells
-from ratslam.network.config import Network
+from ratslam.network import grid_cells, pose_cells
+from ratslam.network.config import Network, SheetConfig
 from ratslam.network.pose_cells import Belief
 from ratslam.places.map_views import MapViews, PieceTies
 from ratslam.recall import filter, observation_model
@@ -288,6 +288,27 @@ class RecallBackend(Backend):
             lambda state: each(state, np.arange(np.prod(shape))),
             active,
             lambda evidence: (evidence.packet / units[::-1]) % shape[::-1],
+            lambda evidence: evidence.certainty,
+        )
+
+    def sheet_probe(self, sheet: SheetConfig) -> PoseCellProbe:
+        """Grid cells, which read the belief where odometry has moved it since the last view."""
+        shape, size = grid_cells.sheet_shape(sheet), sheet.spacing / grid_cells.SIDE
+        period = np.array([shape[2], 2 * shape[1] if sheet.twisted else shape[1], 1])
+
+        def each(state: RecallState, chosen: Array) -> Array:
+            memory, mass = state.memory, state.belief.mass
+            motion, here = memory.corrected_motion(), memory.current_pose()
+            cells = filter.view_cells(self.recall, memory)
+            return grid_cells.sheet_activity(sheet, mass, cells, motion, here, chosen)
+
+        return PoseCellProbe(
+            shape,
+            size,
+            each,
+            lambda state: each(state, np.arange(np.prod(shape))),
+            lambda held: (np.arange(len(held)), np.asarray(held)),
+            lambda evidence: (evidence.packet / [size, size, 2 * np.pi]) % period,
             lambda evidence: evidence.certainty,
         )
 

@@ -35,3 +35,13 @@ class Network(NamedTuple):
     excite_heading: float
     miss: float
     leak: float
+
+
+class SheetConfig(Settings):
+    """A sheet of grid cells that read the belief of `backend: recall`, see `ratslam.network.grid_cells`."""
+
+    spacing: PositiveFloat
+    """Distance between neighbouring fields of a cell, m."""
+    twisted: bool = True
+    """Whether a turn along y shifts x by half a turn: fields of a cell are then on a hexagonal lattice, else
+    on a square one."""

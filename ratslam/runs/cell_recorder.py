@@ -49,7 +49,11 @@ def plan_recording(config: RunConfig, source: Source, backend: Backend) -> Recor
     """
     if config.cells is None:
         return None
-    cells = backend.probe()
+    sheet = config.cells.sheet
+    cells = backend.probe() if sheet is None else backend.sheet_probe(sheet)
+    if cells is None and sheet is not None:
+        found = f"`backend: {config.backend}`, whose cells hold no belief"
+        raise InputError("cells.sheet", found, "`backend: recall`", "or remove `cells.sheet`")
     if cells is None:
         found = f"`backend: {config.backend}`, a method without pose cells"
         raise InputError("cells", found, "`backend: recall` or `backend: classic`", "or remove `cells`")

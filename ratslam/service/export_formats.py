@@ -269,8 +269,8 @@ def export_run(
             _, drawn, _ = read_run_cells(directory, config)
             make_new_file(output, lambda path: write_spikes(path, drawn))
         case ".csv":
-            recording, network = _read_cells(directory)  # of all cells, if only sums were recorded
-            scores = analyse_cells(recording, config.peak_rate / settled_peak(network))
+            recording, peak, _ = _read_cells(directory)  # of all cells, if only sums were recorded
+            scores = analyse_cells(recording, config.peak_rate / peak)
             controls = _controls_of(recording, shuffles, config.seed, warn) if shuffles else None
             make_new_file(output, lambda path: write_scores(path, scores, controls))
 
@@ -320,27 +320,29 @@ CURE = "add `cells: {chosen: 64}` to the configuration and run it again"
 def read_run_cells(directory: Path, config: SpikeConfig) -> tuple[CellRecording, SpikeTrains, str]:
     """The recorded chosen cells of a run, their spikes, and the sha256 (hex) of all that they were made from.
 
-    A cell fires at the peak rate at the peak of a settled packet of the run's network; that is computed in
-    float64, also for a run in float32.
+    A cell fires at the peak rate at the peak of a settled packet of the run's network, which is computed in
+    float64 also for a run in float32; where activity is a posterior, when it has all of it.
 
     Raises:
         InputError: the run has no recorded cells, no chosen ones among them, or a file is malformed.
     """
-    recording, network = _read_cells(directory)
+    recording, peak, network = _read_cells(directory)
     file = directory / NAME
     if not len(recording.cell):
         raise InputError(str(file), "no chosen cells", "cells recorded at every step", CURE)
-    spikes = draw_spikes(recording, settled_peak(network), config)
+    spikes = draw_spikes(recording, peak, config)
     documents = [network.model_dump_json().encode(), config.model_dump_json().encode()]
     return recording, spikes, digest_of([file.read_bytes(), *documents])
 
 
-def _read_cells(directory: Path) -> tuple[CellRecording, NetworkConfig]:
-    """The recorded cells of a run and its network; sets JAX to float64."""
+def _read_cells(directory: Path) -> tuple[CellRecording, float, NetworkConfig]:
+    """The recorded cells of a run, the activity at which they fire at the peak rate, and the network; sets
+    JAX to float64."""
     file = directory / NAME
     if not file.exists():
         raise InputError(str(file), "no such file", "a run with recorded pose cells", CURE)
     recording = read_recording(file)
     prepare_precision("float64")
     config = load_config(directory / "config.yaml")
-    return recording, network_of(config.pose_cells, config.attractor)
+    network = network_of(config.pose_cells, config.attractor)
+    return recording, 1.0 if config.backend == "recall" else settled_peak(network), network

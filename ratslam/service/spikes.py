@@ -7,6 +7,11 @@ process of rate 1 are mapped through the inverse of the integral of the rate, wh
 constant rates. There is no refractory period, no burst and no adaptation. A cell draws from a stream named
 after its index: its spikes do not depend on which other cells were chosen, and a longer recording begins
 with those of a shorter one.
+
+Where activity is a posterior, the cells of all hypotheses fire at once, each by its probability. The rival
+hypothesis is that each theta cycle holds one sample of it (Ujfalussy & Orban 2022, eLife 11: e74058). With
+`theta_hz`, one cell is drawn in each cycle by its share of the activity, and fires for all of it: the mean
+over many cycles is the same, and no two hypotheses fire in one cycle.
 """
 
 from __future__ import annotations
@@ -18,7 +23,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jax import lax
-from pydantic import NonNegativeInt, PositiveFloat
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from evaluation.cells.recording import CellRecording
 from ratslam.classic import pose_cells
@@ -71,6 +76,8 @@ class SpikeConfig(Settings):
     """Rate of a cell whose activity equals the reference, Hz."""
     seed: NonNegativeInt = 0
     """Seed of the random streams, one for each cell."""
+    theta_hz: NonNegativeFloat = 0.0
+    """Cycles per second, in each of which one cell is drawn and fires for all; 0: all fire at all times."""
 
 
 class SpikeTrains(NamedTuple):
@@ -97,9 +104,13 @@ def draw_spikes(recording: CellRecording, reference: float, config: SpikeConfig 
 
     Raises:
         InputError: the recording is empty, its times fall, an activity is negative or not finite, a cell is
-            not of the network, or the reference is not positive.
+            not of the network, or the reference is not positive; see `sample_cycles`.
     """
     config = config or SpikeConfig()
+    if config.theta_hz:
+        drawn = sample_cycles(recording.time, recording.activity, config.theta_hz, config.seed)
+        fires = drawn[:, None] == np.arange(len(recording.cell))
+        recording = recording._replace(activity=fires.astype(np.float32))
     expected_counts = expected_spikes(recording, reference, config.peak_rate)
     time = np.asarray(recording.time, np.float64)
     times = []
@@ -111,6 +122,32 @@ def draw_spikes(recording: CellRecording, reference: float, config: SpikeConfig 
         share = (arrivals - integral[row]) / (integral[row + 1] - integral[row])
         times.append(np.minimum(time[row] + share * (time[row + 1] - time[row]), time[row + 1]))
     return SpikeTrains(np.asarray(recording.cell, np.int32), times, float(time[0]), float(time[-1]), config)
+
+
+def sample_cycles(time: np.ndarray, activity: np.ndarray, theta_hz: float, seed: int) -> np.ndarray:
+    """[T] int, the cell that is drawn in the theta cycle of each step: its column, or -1 for none of them.
+
+    A cell is drawn with a probability that is its activity at the first step of the cycle; what is missing to
+    1 is that of other cells and of novelty.
+
+    Args:
+        time: [T] s, ascending. activity: [T, C] of cells that exclude each other. theta_hz: cycles per
+            second, above 0.
+
+    Raises:
+        InputError: the activity of a step is more than 1 or less than 0.
+    """
+    first, cycle = np.unique(np.floor((time - time[0]) * theta_hz), return_index=True, return_inverse=True)[
+        1:
+    ]
+    ends = np.cumsum(np.asarray(activity, np.float64)[first], axis=1)
+    if not (np.diff(ends, axis=1, prepend=0.0) >= 0).all() or not (ends <= 1 + 1e-4).all():
+        found = f"activity from {np.min(activity):.3g}, in sum up to {ends.max():.3g}"
+        cure = "grid cells overlap: record the pose cells, without `cells.sheet`"
+        raise InputError("theta", found, "probabilities of cells that exclude each other", cure)
+    at = stream(seed, "theta cycles").random(len(first))
+    drawn = (ends <= at[:, None]).sum(axis=1)
+    return np.where(drawn == activity.shape[1], -1, drawn)[cycle]
 
 
 def expected_spikes(recording: CellRecording, reference: float, peak_rate: float) -> np.ndarray:

@@ -102,12 +102,13 @@ def measure_torus(
 
 def measure_cells(
     recording: CellRecording, activity: np.ndarray, size: tuple[float, float], bin: float, shuffles: int,
-    seed: int,
+    seed: int, smoothing: float = SMOOTHING,
 ) -> _LatticeFigures:  # fmt: skip
     """The figures of activity [T, n] along the path of a recording.
 
     Args:
         size: of the box, m, with a corner at the origin. bin: m. shuffles: of each cell, at least 19.
+            smoothing: standard deviation of the Gaussian over rate maps, m.
 
     Raises:
         InputError: see `shuffled_scores`.
@@ -118,7 +119,7 @@ def measure_cells(
     bins = PathBins(place, shape, sample_seconds(recording.time))
 
     def score(lattice: Lattice, rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-        return lattice_scores(autocorrelogram(smooth_rates(rates, seconds, SMOOTHING / bin)), lattice)
+        return lattice_scores(autocorrelogram(smooth_rates(rates, seconds, smoothing / bin)), lattice)
 
     hexagonal, square = (
         shuffled_scores(activity, bins, partial(score, lattice), shuffles, seed)
@@ -129,7 +130,7 @@ def measure_cells(
     seconds = np.bincount(at, weight, count)
     sums = np.array([np.bincount(at, weight * cell, count) for cell in activity[inside].T])
     rates = (sums / np.where(seconds > 0, seconds, np.nan)).reshape(-1, *shape)
-    maps = smooth_rates(rates, seconds.reshape(shape), SMOOTHING / bin)
+    maps = smooth_rates(rates, seconds.reshape(shape), smoothing / bin)
     spacing, _ = measure_lattice(autocorrelogram(maps), bin, SQUARE)
     fields = find_fields(maps, least_bins=round(FIELD / bin**2))
     return _LatticeFigures(size, bin, maps, hexagonal, square, spacing, fields.number)

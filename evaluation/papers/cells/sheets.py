@@ -1,0 +1,219 @@
+"""The figure of the sheets: grid cells that read the belief of `backend: recall` on a twisted torus.
+
+The map is made by the belief and not by the sheet (`ratslam.network.grid_cells`), so that a twisted and a
+square sheet read the same sessions. Odometry has errors, views anchor the belief; beside it exact odometry
+without views, which is path integration alone. Cells are drawn by the seed, none is selected.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from evaluation.cells.grid_score import autocorrelogram
+from evaluation.cells.recording import CellRecording
+from evaluation.cells.shuffling import ShuffledScores
+from evaluation.papers.cells.panels import name_panel, panel_grid
+from evaluation.papers.cells.rat_sessions import PACKAGED, RatSessions
+from evaluation.papers.cells.torus import measure_cells
+from evaluation.papers.figure import Figure, Task
+from evaluation.papers.tables.markdown import table_lines
+from evaluation.plots import style
+from ratslam.network.config import SheetConfig
+from ratslam.network.grid_cells import sheet_activity
+from ratslam.network.pose_cells import ViewCells
+from ratslam.runs.build_session import open_observations
+from ratslam.runs.settings.run_config import load_config
+from tactile.base.se2 import between
+
+CELLS, SHUFFLES, SESSIONS, SECONDS = 64, 40, 5, 599.0
+CELLS_ACROSS = 10
+"""Pose cells along the shorter side of the box."""
+SPACINGS = 10 / 3
+"""Shorter side of the box over the distance between fields."""
+BINS = 12
+"""Bins of a map for each spacing; maps are smoothed by 1.5 of them."""
+GOAL, LARGEST_ERROR = 0.8, 0.25
+"""Median grid score; error of what the cells say, spacings."""
+
+
+BOXES = {"sargolini": (1.0, 1.0), "tanni": (3.5, 2.5)}
+"""Of the packaged paths of rats, m."""
+CLEAR = ["recall.sharpness=0.04", "recall.floor=0.6"]
+"""Views of this box have little noise, so that a small difference tells more than the usual settings say."""
+DARK = ["rat_simulation.phases=[{start: 0, dark: true}]"]
+DARK += ["rat_simulation.odometry={speed_white: 0, heading_white: 0}"]
+TWISTED = "twisted sheet"
+WAYS: Mapping[str, tuple[bool, list[str]]] = {
+    TWISTED: (True, CLEAR),
+    "square sheet (control)": (False, CLEAR),
+    "twisted sheet, exact odometry without views": (True, DARK),
+}
+COLOURS = dict(zip(WAYS, (style.BLUE, style.VERMILLION, style.GREEN), strict=True))
+
+
+class _Sheets(NamedTuple):
+    """Grid cells of n sessions of one path and one sheet, C of each.
+
+    Attributes:
+        hexagonal, square: lattice scores [n * C] and their shuffles. error: [n] root mean square of
+            `sheet_errors`, spacings. maps: [C, H, W] of the first session.
+    """
+
+    hexagonal: ShuffledScores
+    square: ShuffledScores
+    error: np.ndarray
+    maps: np.ndarray
+
+
+_Result = Mapping[str, Mapping[str, _Sheets]]
+"""By path and by sheet."""
+
+
+def measure_sheets(
+    task: Task, cells: int = CELLS, shuffles: int = SHUFFLES, paths: tuple[str, ...] = tuple(BOXES),
+    seconds: float = SECONDS,
+) -> _Result:  # fmt: skip
+    """The grid cells of sessions of each path and sheet; the controls have one session each.
+
+    Args:
+        cells: of a session. shuffles: of each cell. seconds: of a session.
+    """
+    return {
+        path: {way: _measure(task, path, way, cells, shuffles, seconds) for way in WAYS} for path in paths
+    }
+
+
+def _measure(task: Task, path: str, way: str, cells: int, shuffles: int, seconds: float) -> _Sheets:
+    box = BOXES[path]
+    spacing = min(box) / SPACINGS
+    bin, found, errors = spacing / BINS, [], []
+    for seed in task.seeds(SESSIONS) if way == TWISTED else (task.first,):
+        recording = record_sheet(path, way, cells, seed, seconds)
+        active = recording.activity
+        found.append(measure_cells(recording, active, box, bin, shuffles, seed, 1.5 * bin))
+        errors.append(np.sqrt(np.mean(sheet_errors(recording, spacing) ** 2)) / spacing)
+    hexagonal, square = (
+        ShuffledScores(
+            np.concatenate([each.score for each in scores]),
+            np.concatenate([each.shuffled for each in scores], axis=1),
+        )
+        for scores in ([one.hexagonal for one in found], [one.square for one in found])
+    )
+    return _Sheets(hexagonal, square, np.array(errors), found[0].maps)
+
+
+def record_sheet(path: str, way: str, cells: int, seed: int, seconds: float) -> CellRecording:
+    """The grid cells of a session of `rat_box` with `backend: recall`.
+
+    Args:
+        path: of `BOXES`. way: of `WAYS`. cells: drawn by the seed, which is also that of the odometry's
+            errors.
+    """
+    (width, height), (twisted, more) = BOXES[path], WAYS[way]
+    sheet = {"spacing": min(width, height) / SPACINGS, "twisted": twisted}
+    own = [f"rat_simulation.seconds={seconds}", f"rat_simulation.seed={seed}", f"session.seed={seed}"]
+    own += [f"rat_simulation.path.file={path}", f"rat_simulation.box={{width: {width}, height: {height}}}"]
+    own += ["backend=recall", f"pose_cells.cell_size={min(width, height) / CELLS_ACROSS}"]
+    own += [f"cells={json.dumps({'chosen': cells, 'sheet': sheet})}", "session.reserve=4096"]
+    with open_observations(load_config(PACKAGED, own + more)) as (config, source):
+        return RatSessions(config).run(source)
+
+
+def sheet_errors(recording: CellRecording, spacing: float) -> np.ndarray:
+    """[T] distance, m, from the true place to the nearest one at which a certain belief would make the
+    recorded cells as active as they are, by least squares; at most 0.6 spacings, about 0.4 by chance.
+
+    The map begins in the frame of the first true pose.
+    """
+    sheet = SheetConfig(spacing=spacing, twisted=recording.shape[1] < recording.shape[2])
+    at = np.stack(np.unravel_index(np.arange(np.prod(recording.shape)), recording.shape)[:0:-1], axis=1)
+    at = np.column_stack([at * recording.cell_size, np.zeros(len(at))])
+    nothing = jnp.zeros((1, 0), jnp.float32)
+    certain = partial(
+        sheet_activity, sheet, nothing, ViewCells(*[nothing] * 6), jnp.zeros(3), chosen=recording.cell
+    )
+    tuned = np.asarray(jax.vmap(certain)(jnp.asarray(at)), np.float64)
+    best = (2 * recording.activity @ tuned.T - (tuned**2).sum(axis=1)).argmax(axis=1)
+    off = at[best, :2] - between(recording.truth[0], recording.truth)[:, :2]
+    up = np.sqrt(0.75) if sheet.twisted else 1.0
+    rows = np.floor(off[:, 1] / (up * spacing))[:, None] + [0, 1]
+    y = off[:, 1:] - rows * up * spacing
+    x = off[:, :1] - rows * (0.5 * sheet.twisted) * spacing
+    x -= spacing * np.round(x / spacing)
+    return np.hypot(x, y).min(axis=1)
+
+
+def _table_sheets(result: _Result) -> list[str]:
+    columns = (
+        "path", "sheet", "cells", "grid score: median", "5 to 95 % of cells", "95 % of shuffles", "above it",
+        "square score", "error, spacings: median", "worst",
+    )  # fmt: skip
+    boxes = ", ".join(f"{path} {BOXES[path][0]:g} x {BOXES[path][1]:g} m" for path in result)
+    above = (
+        f"Cells drawn by the seed, none selected; {boxes}; {SPACINGS:.2f} spacings along the shorter side."
+        f" Goal: median grid score of at least {GOAL:g}, an error below {LARGEST_ERROR:g} spacings. The map"
+        " is the same with each sheet and without one."
+    )
+    rows = []
+    for path, ways in result.items():
+        for way, found in ways.items():
+            scores = found.hexagonal
+            known = scores.score[np.isfinite(scores.score)]
+            low, high = np.percentile(known, [5, 95]) if known.size else (np.nan, np.nan)
+            control = f"{np.nanmedian(scores.percentile):.2f}", f"{100 * scores.above.mean():.0f} %"
+            spread = f"{np.median(known) if known.size else np.nan:.2f}", f"{low:.2f} to {high:.2f}"
+            square = f"{np.nanmedian(found.square.score):.2f}"
+            errors = f"{np.median(found.error):.2f}", f"{found.error.max():.2f}"
+            rows.append([path, way, str(len(scores.score)), *spread, *control, square, *errors])
+    below = (
+        "Not shown: a sheet that is learned, several modules, distortion by the walls: the lattice is built"
+        " in, and what is measured is whether the belief is sharp enough to show it."
+    )
+    return table_lines([above], columns, rows, [below])
+
+
+SHOWN = 6
+"""Cells drawn of each path."""
+
+
+def _draw_sheets(result: _Result, png: Path) -> None:
+    """Rate maps and autocorrelograms of the first cells of the twisted sheet, and all scores."""
+    medians = {path: np.nanmedian(ways[TWISTED].hexagonal.score) for path, ways in result.items()}
+    line = "Median grid score: " + ", ".join(f"{path} {score:.2f}" for path, score in medians.items())
+    line += ". Maps: the first cells drawn; below each its autocorrelogram."
+    figure, axes = panel_grid("Hexagons from a twisted sheet", line, 3 * len(result), SHOWN, height=1.1)
+    for number, (path, ways) in enumerate(result.items()):
+        maps = ways[TWISTED].maps[:SHOWN]
+        for column, (rates, lags) in enumerate(zip(maps, autocorrelogram(maps), strict=True)):
+            kinds: list[tuple[np.ndarray, dict[str, Any]]] = [
+                (rates, {"cmap": "viridis", "vmin": 0}),
+                (lags, {"cmap": "RdBu_r", "vmin": -1, "vmax": 1}),
+            ]
+            for row, (values, how) in enumerate(kinds):
+                panel = axes[3 * number + row][column]
+                panel.grid(False)
+                panel.imshow(values, origin="lower", **how)
+                panel.set(xticks=[], yticks=[])
+        name_panel(axes[3 * number][0], path, "", "rate")
+        scores = axes[3 * number + 2]
+        for panel in scores[1:]:
+            panel.remove()
+        at = scores[0].get_position()
+        scores[0].set_position((at.x0, at.y0, axes[0][-1].get_position().x1 - at.x0, at.height))
+        for way, found in ways.items():
+            known = found.hexagonal.score[np.isfinite(found.hexagonal.score)]
+            bins = np.linspace(-1.0, 1.6, 53).tolist()
+            scores[0].hist(known, bins, color=COLOURS[way], alpha=0.6, label=way)
+        name_panel(scores[0], "", "grid score", "cells")
+    style.add_legend(figure, axes[2][0], columns=2).savefig(png)
+
+
+FIGURE = Figure("Hexagons from a twisted sheet", measure_sheets, _table_sheets, _draw_sheets)
