@@ -23,6 +23,8 @@ MOST, RATE = 120, 10
 DPI = 65
 LEAST = 0.02
 """Smallest mass of a packet that is drawn."""
+ROOM = 0.08
+"""Free around the packets, share of the longer side."""
 
 
 class Frame(NamedTuple):
@@ -102,6 +104,7 @@ def _moving_figure(title: str, frames: Sequence[Frame]) -> tuple[style.Figure, A
     places = np.concatenate([each.packets[each.packets[:, 3] > LEAST, :2] for each in frames])
     poses = np.array([each.pose for each in frames])
     box = style.frame(places if len(places) else poses[:, :2])
+    box += ROOM * np.max(box[1] - box[0]) * np.array([[-1], [1]])
     time = np.array([each.time for each in frames]) - frames[0].time
     heaviest, second = (
         np.array([each.packets[k, 3] if len(each.packets) > k else 0.0 for each in frames]) for k in (0, 1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,8 @@ import numpy as np
 from evaluation.cells.grid_score import autocorrelogram
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import ShuffledScores
-from evaluation.papers.cells.panels import name_panel, panel_grid
+from evaluation.cells.topology import Holes, find_holes, shuffled_holes
+from evaluation.papers.cells.panels import name_panel, panel_row
 from evaluation.papers.cells.rat_sessions import PACKAGED, RatSessions
 from evaluation.papers.cells.torus import measure_cells
 from evaluation.papers.figure import Figure, Task
@@ -34,9 +36,10 @@ from ratslam.runs.settings.run_config import load_config
 from tactile.base.se2 import between
 
 CELLS, SHUFFLES, SESSIONS, SECONDS = 64, 40, 5, 599.0
+HOLE_SHUFFLES = 20
 CELLS_ACROSS = 10
 """Pose cells along the shorter side of the box."""
-SPACINGS = 10 / 3
+SPACINGS = 3.0
 """Shorter side of the box over the distance between fields."""
 BINS = 12
 """Bins of a map for each spacing; maps are smoothed by 1.5 of them."""
@@ -46,8 +49,9 @@ GOAL, LARGEST_ERROR = 0.8, 0.25
 
 BOXES = {"sargolini": (1.0, 1.0), "tanni": (3.5, 2.5)}
 """Of the packaged paths of rats, m."""
-CLEAR = ["recall.sharpness=0.04", "recall.floor=0.6"]
-"""Views of this box have little noise, so that a small difference tells more than the usual settings say."""
+CLEAR = ["recall.sharpness=0.04", "recall.floor=0.4", "recall.local=0.9"]
+"""Views of this box have little noise, so that a small difference tells more than the usual settings say; and
+nobody carries the rat, so that it enters anew near the map's pose."""
 DARK = ["rat_simulation.phases=[{start: 0, dark: true}]"]
 DARK += ["rat_simulation.odometry={speed_white: 0, heading_white: 0}"]
 TWISTED = "twisted sheet"
@@ -64,13 +68,15 @@ class _Sheets(NamedTuple):
 
     Attributes:
         hexagonal, square: lattice scores [n * C] and their shuffles. error: [n] root mean square of
-            `sheet_errors`, spacings. maps: [C, H, W] of the first session.
+            `sheet_errors`, spacings. maps: [C, H, W] of the first session. holes: of its second half, then of
+            shuffles; of the twisted sheet alone, and not without ripser.
     """
 
     hexagonal: ShuffledScores
     square: ShuffledScores
     error: np.ndarray
     maps: np.ndarray
+    holes: list[Holes]
 
 
 _Result = Mapping[str, Mapping[str, _Sheets]]
@@ -94,11 +100,14 @@ def measure_sheets(
 def _measure(task: Task, path: str, way: str, cells: int, shuffles: int, seconds: float) -> _Sheets:
     box = BOXES[path]
     spacing = min(box) / SPACINGS
-    bin, found, errors = spacing / BINS, [], []
+    bin, found, errors, holes = spacing / BINS, [], [], []
     for seed in task.seeds(SESSIONS) if way == TWISTED else (task.first,):
         recording = record_sheet(path, way, cells, seed, seconds)
         active = recording.activity
         found.append(measure_cells(recording, active, box, bin, shuffles, seed, 1.5 * bin))
+        if way == TWISTED and seed == task.first and find_spec("ripser"):
+            later = active[len(active) // 2 :]
+            holes = [find_holes(later), *shuffled_holes(later, len(later) / seconds * 2, HOLE_SHUFFLES, seed)]
         errors.append(np.sqrt(np.mean(sheet_errors(recording, spacing) ** 2)) / spacing)
     hexagonal, square = (
         ShuffledScores(
@@ -107,7 +116,7 @@ def _measure(task: Task, path: str, way: str, cells: int, shuffles: int, seconds
         )
         for scores in ([one.hexagonal for one in found], [one.square for one in found])
     )
-    return _Sheets(hexagonal, square, np.array(errors), found[0].maps)
+    return _Sheets(hexagonal, square, np.array(errors), found[0].maps, holes)
 
 
 def record_sheet(path: str, way: str, cells: int, seed: int, seconds: float) -> CellRecording:
@@ -173,47 +182,68 @@ def _table_sheets(result: _Result) -> list[str]:
             square = f"{np.nanmedian(found.square.score):.2f}"
             errors = f"{np.median(found.error):.2f}", f"{found.error.max():.2f}"
             rows.append([path, way, str(len(scores.score)), *spread, *control, square, *errors])
+    lines = [holes_line(path, ways[TWISTED].holes) for path, ways in result.items()]
     below = (
         "Not shown: a sheet that is learned, several modules, distortion by the walls: the lattice is built"
         " in, and what is measured is whether the belief is sharp enough to show it."
     )
-    return table_lines([above], columns, rows, [below])
+    return table_lines([above], columns, rows, [*filter(None, lines), below])
+
+
+def holes_line(path: str, holes: list[Holes]) -> str:
+    """What persistent homology found; "" without it."""
+    if not holes:
+        return ""
+    (loops, voids), *others = holes
+    most = [max(each[kind].max(initial=0.0) for each in others) for kind in (0, 1)]
+    counts = int((loops > most[0]).sum()), int((voids > most[1]).sum())
+    longest = ", ".join(f"{each:.2f}" for each in loops[:3])
+    return (
+        f"Persistent homology, {path}: {counts[0]} loops and {counts[1]} voids live longer than all of"
+        f" {len(others)} shuffles (goal: 2 and 1 at least). Loops {longest}; shuffles {most[0]:.2f} at most;"
+        f" void {voids.max(initial=0.0):.2f}; shuffles {most[1]:.2f}."
+    )
 
 
 SHOWN = 6
 """Cells drawn of each path."""
+GAP, HEAD, LOW, HIGH = 0.12, 0.3, 1.0, 1.4
+"""Inches: between maps; above a row of them; below and height of the histograms."""
 
 
 def _draw_sheets(result: _Result, png: Path) -> None:
     """Rate maps and autocorrelograms of the first cells of the twisted sheet, and all scores."""
     medians = {path: np.nanmedian(ways[TWISTED].hexagonal.score) for path, ways in result.items()}
-    line = "Median grid score: " + ", ".join(f"{path} {score:.2f}" for path, score in medians.items())
-    line += ". Maps: the first cells drawn; below each its autocorrelogram."
-    figure, axes = panel_grid("Hexagons from a twisted sheet", line, 3 * len(result), SHOWN, height=1.1)
-    for number, (path, ways) in enumerate(result.items()):
+    line = "median grid score: " + ", ".join(f"{path} {score:.2f}" for path, score in medians.items())
+    line += "; maps of the first cells drawn, below each its autocorrelogram"
+    wide = (style.INNER - (SHOWN - 1) * GAP) / SHOWN
+    tall = [wide * BOXES[path][1] / BOXES[path][0] for path in result]
+    height = style.TOP + sum(2 * (HEAD + each) for each in tall) + 0.3 + HIGH + LOW
+    figure = style.new_figure(height, "Hexagons from a twisted sheet", line)
+    top = height - style.TOP
+    for (path, ways), up in zip(result.items(), tall, strict=True):
         maps = ways[TWISTED].maps[:SHOWN]
-        for column, (rates, lags) in enumerate(zip(maps, autocorrelogram(maps), strict=True)):
-            kinds: list[tuple[np.ndarray, dict[str, Any]]] = [
-                (rates, {"cmap": "viridis", "vmin": 0}),
-                (lags, {"cmap": "RdBu_r", "vmin": -1, "vmax": 1}),
-            ]
-            for row, (values, how) in enumerate(kinds):
-                panel = axes[3 * number + row][column]
-                panel.grid(False)
-                panel.imshow(values, origin="lower", **how)
-                panel.set(xticks=[], yticks=[])
-        name_panel(axes[3 * number][0], path, "", "rate")
-        scores = axes[3 * number + 2]
-        for panel in scores[1:]:
-            panel.remove()
-        at = scores[0].get_position()
-        scores[0].set_position((at.x0, at.y0, axes[0][-1].get_position().x1 - at.x0, at.height))
+        kinds: list[tuple[str, np.ndarray, dict[str, Any]]] = [
+            (f"{path}: rates, dark 0 to yellow their peak", maps, {"cmap": "viridis", "vmin": 0}),
+            ("autocorrelograms", autocorrelogram(maps), {"cmap": "RdBu_r", "vmin": -1, "vmax": 1}),
+        ]
+        for name, images, how in kinds:
+            top -= HEAD
+            figure.text(style.LEFT / style.WIDTH, (top + 0.07) / height, name, fontsize=9, color=style.INK)
+            top -= up
+            for column, values in enumerate(images):
+                axes = style.add_axes(figure, style.LEFT + column * (wide + GAP), top, wide, up)
+                axes.imshow(values, origin="lower", aspect="auto", **how)
+                axes.set(xticks=[], yticks=[])
+    for panel, (path, ways) in zip(
+        panel_row(figure, len(result), 0.6, LOW, HIGH), result.items(), strict=True
+    ):
         for way, found in ways.items():
             known = found.hexagonal.score[np.isfinite(found.hexagonal.score)]
             bins = np.linspace(-1.0, 1.6, 53).tolist()
-            scores[0].hist(known, bins, color=COLOURS[way], alpha=0.6, label=way)
-        name_panel(scores[0], "", "grid score", "cells")
-    style.add_legend(figure, axes[2][0], columns=2).savefig(png)
+            panel.hist(known, bins, color=COLOURS[way], alpha=0.6, label=way, density=True)
+        name_panel(panel, "", f"grid score, {path}", "density")
+    style.add_legend(figure, panel, columns=3).savefig(png)
 
 
 FIGURE = Figure("Hexagons from a twisted sheet", measure_sheets, _table_sheets, _draw_sheets)
