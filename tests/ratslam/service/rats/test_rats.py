@@ -306,7 +306,7 @@ def test_bad_recordings_get_one_clear_error():
 # Files
 
 CHOSEN = [5, 1, 300]
-RUN_CONFIG = "recording: {file: none.bag}\npose_cells: {cells_xy: 7, cells_heading: 8}\n"
+RUN_CONFIG = "backend: classic\nrecording: {file: none.bag}\npose_cells: {cells_xy: 7, cells_heading: 8}\n"
 NETWORK = NetworkConfig(cells_xy=7, cells_heading=8)
 
 
@@ -382,6 +382,19 @@ def test_numpy_spikes_are_those_of_the_settings_and_scores_are_a_line_for_each_c
     scores = analyse_cells(three, 30 / settled_peak(NETWORK))
     np.testing.assert_array_equal(table["cell"], CHOSEN)
     np.testing.assert_array_equal(table["mean_rate"], scores.mean_rate)
+
+
+def test_a_cell_of_a_belief_has_the_peak_rate_at_an_activity_of_1_and_theta_cycles_sample_it(
+    run, three, tmp_path, capsys
+):
+    (run / "config.yaml").write_text(RUN_CONFIG.replace("classic", "recall"))
+    shared = three._replace(activity=three.activity / three.activity.sum(axis=1).max())
+    write_recording(run / "cells.npz", shared)
+    for options, config in (((), SpikeConfig()), (("--theta", "8"), SpikeConfig(theta_hz=8.0))):
+        output = tmp_path / f"{len(options)}.npz"
+        said(capsys, "export", run, "-o", output, *options)
+        for one, other in zip(read_spikes(output).times, draw_spikes(shared, 1.0, config).times, strict=True):
+            np.testing.assert_array_equal(one, other)
 
 
 def test_spikes_without_chosen_cells_or_of_others_or_without_pynwb_are_refused(
