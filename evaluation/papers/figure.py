@@ -19,7 +19,6 @@ CELLS = {
     "rotation": "cells.rotation.FIGURE",
     "boxes": "cells.boxes.FIGURE",
     "torus": "cells.torus.FIGURE",
-    "sheets": "cells.sheets.FIGURE",
     "analysis_cost": "cells.costs.ANALYSIS",
     "agreement": "cells.agreement.FIGURE",
     "shuffles": "cells.shuffles.FIGURE",
@@ -33,6 +32,7 @@ CELLS = {
     "kidnap": "cells.belief_rows.KIDNAP_FIGURE",
     "cue_conflict": "cells.belief_rows.CONFLICT_FIGURE",
     "theta": "cells.theta.FIGURE",
+    "sheets": "cells.sheets.FIGURE",
     "lesions": "cells.belief_lesions.LESIONS_FIGURE",
     "scale": "cells.belief_lesions.SCALE_FIGURE",
 }

@@ -46,7 +46,7 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 """The start of a session whose start is not given. Times in the file are those of the source in s: dates are
 right if the source counts from 1970, and unknown otherwise."""
 TRUE_FRAME = "world frame of the source; x forward at heading 0, y left of it"
-TORUS_FRAME = "torus of pose cells: x and y in 0 to {side:g} m, where they begin again"
+TORUS_FRAME = "torus of cells: x in 0 to {:g} m, y in 0 to {:g} m, where they begin again"
 HEADING_FRAME = "counter-clockwise from the x axis, rad"
 TRUE_NAMES, PACKET_NAMES = ("Position", "CompassDirection"), ("PacketPosition", "PacketDirection")
 
@@ -134,7 +134,7 @@ def write_nwb(
     if any(own.values()):
         file.subject = pynwb.file.Subject(**{key: value for key, value in own.items() if value})
     module = file.create_processing_module("behavior", "true pose of the robot and decoded packet")
-    torus = TORUS_FRAME.format(side=recording.torus_sides[0])
+    torus = TORUS_FRAME.format(*recording.torus_sides[:2])
     true = np.asarray(recording.truth, float)
     times: Any = recording.time  # the first series holds them, the others refer to it
     for names, prefix, pose, frame in (

@@ -83,7 +83,7 @@ def _contrast(place: np.ndarray, belief: np.ndarray, sampled: bool, seed: int) -
         held = (drawn[:, None] == np.arange(len(place))).astype(float)
     count, unknown = len(time), np.full((len(time), 3), np.nan)
     recording = CellRecording(
-        (1, 1, len(place)), 1.0, time, unknown, unknown, np.zeros(count), np.zeros(count, np.int32),
+        (len(place), 1, 1), 1.0, time, unknown, unknown, np.zeros(count), np.zeros(count, np.int32),
         np.arange(len(place)), held @ tuning, None,
     )  # fmt: skip
     spikes = draw_spikes(recording, 1.0, SpikeConfig(seed=seed))
