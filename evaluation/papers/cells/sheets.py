@@ -35,7 +35,7 @@ from ratslam.runs.build_session import open_observations
 from ratslam.runs.settings.run_config import load_config
 from tactile.base.se2 import between
 
-CELLS, SHUFFLES, SESSIONS, SECONDS = 64, 40, 5, 599.0
+CELLS, SHUFFLES, SESSIONS, SECONDS = 64, 20, 5, 599.0
 HOLE_SHUFFLES = 20
 CELLS_ACROSS = 10
 """Pose cells along the shorter side of the box."""

@@ -14,6 +14,7 @@ from evaluation.papers.cells.agreement import compare_scores
 from evaluation.papers.cells.belief_lesions import measure_sizes
 from evaluation.papers.cells.costs import measure_analysis, measure_networks
 from evaluation.papers.cells.rotation import measure_rotation, rotation_of
+from evaluation.papers.cells.sheets import measure_sheets
 from evaluation.papers.cells.shuffles import check_shuffles
 from evaluation.papers.cells.torus import measure_cells, measure_torus
 from evaluation.papers.figure import CELLS, MAPS, REAL, Task, find_figure
@@ -102,6 +103,7 @@ def test_spacing_is_the_side_of_the_torus_and_a_smaller_box_holds_no_lattice():
     ("boxes", lambda: boxes.measure_boxes(Task(41009, 1), seconds=12.0, columns=8)),
     ("agreement", lambda: compare_scores(Task(3, 12), seconds=30.0)),
     ("torus", lambda: measure_torus(Task(41009, 1), seconds=(60.0, 45.0), columns=6, shuffles=19)),
+    ("sheets", lambda: measure_sheets(Task(41009, 1), 6, 19, ("sargolini",), 90.0)),
     ("shuffles", lambda: check_shuffles(Task(3, 12), shuffles=19, seconds=60.0)),
     ("analysis_cost", lambda: measure_analysis(cells=4, shuffles=19, seconds=60.0)),
     ("networks", lambda: measure_networks(sets=1, steps=200)),
