@@ -66,8 +66,8 @@ own, or minutes to hours. They are parsed, and their configurations validated; m
 REFUSED = {"python -m ratslam run square --continue runs/square -o runs/rest": "already holds all 349"}
 """What is refused, as its README says: that run was not interrupted."""
 SLOW = (
-    "run create_arena", "run rat_box", "run rat_kidnap", "run whisker_maze", "simulate ", "export runs/rat",
-    "timeit ", "run square -o runs/seen", "cells score runs/rat", "cells compare runs/rat",
+    "run create_arena", "run rat_box", "run rat_kidnap", "run rat_grid", "run whisker_maze", "simulate ",
+    "export runs/rat", "timeit ", "run square -o runs/seen", "cells score runs/rat", "cells compare runs/rat",
 )  # fmt: skip
 """Commands that take longest: for `make soak`."""
 

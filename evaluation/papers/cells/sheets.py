@@ -23,7 +23,7 @@ from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import ShuffledScores
 from evaluation.cells.topology import Holes, find_holes, shuffled_holes
 from evaluation.papers.cells.panels import name_panel, panel_row
-from evaluation.papers.cells.rat_sessions import PACKAGED, RatSessions
+from evaluation.papers.cells.rat_sessions import RatSessions
 from evaluation.papers.cells.torus import measure_cells
 from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import table_lines
@@ -49,15 +49,12 @@ GOAL, LARGEST_ERROR = 0.8, 0.25
 
 BOXES = {"sargolini": (1.0, 1.0), "tanni": (3.5, 2.5)}
 """Of the packaged paths of rats, m."""
-CLEAR = ["recall.sharpness=0.04", "recall.floor=0.4", "recall.local=0.9"]
-"""Views of this box have little noise, so that a small difference tells more than the usual settings say; and
-nobody carries the rat, so that it enters anew near the map's pose."""
 DARK = ["rat_simulation.phases=[{start: 0, dark: true}]"]
 DARK += ["rat_simulation.odometry={speed_white: 0, heading_white: 0}"]
 TWISTED = "twisted sheet"
 WAYS: Mapping[str, tuple[bool, list[str]]] = {
-    TWISTED: (True, CLEAR),
-    "square sheet (control)": (False, CLEAR),
+    TWISTED: (True, []),
+    "square sheet (control)": (False, []),
     "twisted sheet, exact odometry without views": (True, DARK),
 }
 COLOURS = dict(zip(WAYS, (style.BLUE, style.VERMILLION, style.GREEN), strict=True))
@@ -120,7 +117,7 @@ def _measure(task: Task, path: str, way: str, cells: int, shuffles: int, seconds
 
 
 def record_sheet(path: str, way: str, cells: int, seed: int, seconds: float) -> CellRecording:
-    """The grid cells of a session of `rat_box` with `backend: recall`.
+    """The grid cells of a session of `rat_grid`.
 
     Args:
         path: of `BOXES`. way: of `WAYS`. cells: drawn by the seed, which is also that of the odometry's
@@ -130,9 +127,9 @@ def record_sheet(path: str, way: str, cells: int, seed: int, seconds: float) -> 
     sheet = {"spacing": min(width, height) / SPACINGS, "twisted": twisted}
     own = [f"rat_simulation.seconds={seconds}", f"rat_simulation.seed={seed}", f"session.seed={seed}"]
     own += [f"rat_simulation.path.file={path}", f"rat_simulation.box={{width: {width}, height: {height}}}"]
-    own += ["backend=recall", f"pose_cells.cell_size={min(width, height) / CELLS_ACROSS}"]
-    own += [f"cells={json.dumps({'chosen': cells, 'sheet': sheet})}", "session.reserve=4096"]
-    with open_observations(load_config(PACKAGED, own + more)) as (config, source):
+    own += [f"pose_cells.cell_size={min(width, height) / CELLS_ACROSS}"]
+    own += [f"cells={json.dumps({'chosen': cells, 'sheet': sheet})}"]
+    with open_observations(load_config("rat_grid", own + more)) as (config, source):
         return RatSessions(config).run(source)
 
 
