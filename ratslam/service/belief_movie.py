@@ -18,7 +18,7 @@ from ratslam.runs.runner import MapReport, RunDescription
 from tactile.base.errors import InputError
 from tactile.base.files import make_new_file
 
-MOST, RATE = 120, 10
+MOST, RATE = 60, 6
 """Most frames of an animation, evenly spread over all; frames per second."""
 DPI = 65
 LEAST = 0.02
