@@ -35,6 +35,13 @@ def sheet_shape(sheet: SheetConfig) -> tuple[int, int, int]:
     return 1, ROWS if sheet.twisted else SIDE, SIDE
 
 
+def sheet_waves(sheet: SheetConfig) -> np.ndarray:
+    """[n, 2] wave vectors of the tuning, rad/m."""
+    angle = np.radians([30, 90, 150] if sheet.twisted else [0, 90])
+    length = 2 * np.pi / (sheet.spacing * (np.cos(np.pi / 6) if sheet.twisted else 1))
+    return length * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
 def sheet_activity(
     sheet: SheetConfig, mass: Array, cells: ViewCells, motion: Array, here: Array, chosen: Array
 ) -> Array:
@@ -57,9 +64,7 @@ def sheet_activity(
     weight = jnp.append(weight, jnp.maximum(1 - jnp.sum(weight), 0.0))
     row, column = jnp.divmod(jnp.asarray(chosen), SIDE)
     own = jnp.stack([column, row]).astype(jnp.float32) * (sheet.spacing / SIDE)
-    angle = np.radians([30, 90, 150] if sheet.twisted else [0, 90])
-    length = 2 * np.pi / (sheet.spacing * (np.cos(np.pi / 6) if sheet.twisted else 1))
-    waves = (length * np.stack([np.cos(angle), np.sin(angle)], axis=1)).astype(np.float32)
+    waves = sheet_waves(sheet).astype(np.float32)
     there, preferred = waves @ at, waves @ own
     likeness = jnp.cos(preferred).T @ jnp.cos(there) + jnp.sin(preferred).T @ jnp.sin(there)
     return jnp.exp(SHARP * (likeness / len(waves) - 1)) @ weight
