@@ -41,7 +41,7 @@ _Described = dict[str, tuple[_Statistic, np.ndarray]]
 """By name a statistic, and the values [n, ...] of the cells that have them."""
 
 
-class Row(NamedTuple):
+class ComparedScore(NamedTuple):
     """One line of a comparison.
 
     Attributes:
@@ -73,7 +73,7 @@ def compare_cells(
     least: int = LEAST_SPIKES,
     draws: int = 1000,
     seed: int = 0,
-) -> list[Row]:
+) -> list[ComparedScore]:
     """Compares the cells of two recordings in spikes/s (`recording.record_spikes`).
 
     Of each score the medians, of those with shuffled controls also the share of cells beyond the 95th
@@ -107,7 +107,7 @@ def compare_cells(
             above = _above(values[0], values[1], draws, random)
         is_angle = name.endswith("rad")
         rows.append(
-            Row(
+            ComparedScore(
                 name,
                 (len(values[0]), len(values[1])),
                 _interval(drawn[0], is_angle),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evaluation.cells.cell_comparison import Row
+from evaluation.cells.cell_comparison import ComparedScore
 from evaluation.cells.information import information
 from evaluation.cells.rate_map import known_poses, rate_maps, recorded_sums, tuning_curves
 from evaluation.cells.recording import BinnedSums, CellRecording
@@ -118,7 +118,7 @@ def draw_spikes_on_path(
     return figure
 
 
-def draw_distributions(title: str, rows: Sequence[Row]) -> style.Figure:
+def draw_distributions(title: str, rows: Sequence[ComparedScore]) -> style.Figure:
     """Draws the share of cells up to each value of a score, of the model and of the data, a panel for each
     score; shares and turns have none."""
     drawn = [row for row in rows if np.isfinite(row.above[0])]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evaluation.cells.analysis import analyse_cells, control_scores, write_scores
-from evaluation.cells.cell_comparison import LEAST_SPIKES, Interval, Row, compare_cells
+from evaluation.cells.cell_comparison import LEAST_SPIKES, ComparedScore, Interval, compare_cells
 from evaluation.cells.rate_map import running_speed
 from evaluation.cells.recording import CellRecording, record_spikes
 from ratslam.runs.settings.run_config import load_config
@@ -59,12 +59,9 @@ def read_own_cells(path: Path, config: NwbConfig | None = None, warn: Warn = Non
         heading = np.where(moving, np.arctan2(velocity[:, 1], velocity[:, 0]), np.nan)
     truth = np.column_stack([session.position, heading])
     if session.observed is not None and warn is not None:
-        lost = ~(
-            (session.time[:, None] >= session.observed[:, 0])
-            & (session.time[:, None] <= session.observed[:, 1])
-        ).any(axis=1)
-        if lost.any():
-            warn(f"{path}: {lost.sum()} samples lie outside of the times in which all units were recorded")
+        outside = [(session.time < first) | (session.time > last) for first, last in session.observed]
+        if lost := int(np.all(outside, axis=0).sum()):
+            warn(f"{path}: {lost} samples lie outside of the times in which all units were recorded")
     recording = record_spikes(session.time, truth, session.spikes, session.observed)
     known = np.isfinite(recording.truth).all(axis=1)
     count = sum(map(len, session.spikes))
@@ -106,7 +103,7 @@ def compare_run(
     spikes: SpikeConfig | None = None,
     shuffles: int = 100,
     least: int = LEAST_SPIKES,
-) -> tuple[str, list[Row]]:
+) -> tuple[str, list[ComparedScore]]:
     """The cells of a run beside those of an NWB file; both in words, and the lines of the comparison.
 
     The activity of the run's cells becomes Poisson spikes on its true path, which are scored as the data's
@@ -137,7 +134,7 @@ def compare_run(
 COLUMNS = ("score", "model", "data", "data - model", "P(data > model)", "cells")
 
 
-def comparison_table(rows: list[Row]) -> Iterator[tuple[str, ...]]:
+def comparison_table(rows: list[ComparedScore]) -> Iterator[tuple[str, ...]]:
     """The lines of a comparison as text, its header first; each number with its 95 % interval."""
 
     def shown(interval: Interval) -> str:

@@ -142,6 +142,7 @@ FIGURE = Figure("Agreement with other packages", compare_scores, _agreement_tabl
 HOW = {
     "opexebo": "pip install --no-deps opexebo",
     "pynapple": "pip install pynapple",
+    "pynwb": "pip install 'ratslam[nwb]'",
     "ratinabox.utils": "pip install 'ratslam[ratinabox]'",
 }
 """How each package is installed."""

@@ -24,6 +24,7 @@ from evaluation.papers.cells.costs import on_one_core
 from evaluation.papers.cells.panels import time_call
 from evaluation.papers.figure import Figure, Task
 from evaluation.papers.tables.markdown import table_lines
+from ratslam.service.export_formats import EPOCH
 from ratslam.service.own_cells import read_own_cells
 from robot.simulation.rat.simulated_session import RandomWalkConfig, RatSimulation, RatSimulationConfig
 from tactile.base.random_streams import stream
@@ -85,11 +86,7 @@ def draw_session(
 
 def write_session(path: Path, session: OwnSession) -> None:
     """Writes a session as a laboratory does: a position, a compass and units, by pynwb."""
-    import pynwb
-    import pynwb.behavior
-
-    from ratslam.service.export_formats import EPOCH
-
+    pynwb = load_package("pynwb")
     file = pynwb.NWBFile("cells of known tuning", "own", EPOCH)
     make, module = pynwb.behavior.SpatialSeries, file.create_processing_module("behavior", "tracking")
     position = make(name="position", data=session.truth[:, :2], timestamps=session.time, unit="meters")

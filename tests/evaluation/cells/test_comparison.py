@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from evaluation.cells.analysis import CONTROLLED, analyse_cells, control_scores, speed_score, write_scores
-from evaluation.cells.cell_comparison import Row, compare_cells
+from evaluation.cells.cell_comparison import ComparedScore, compare_cells
 from evaluation.cells.decoding import decode_positions
 from evaluation.cells.rate_map import running_speed
 from evaluation.cells.recording import CellRecording, record_spikes
@@ -48,7 +48,7 @@ def recorded(*rates: np.ndarray, seed: int = 0) -> CellRecording:
     return record_spikes(*WALK, spikes_of(np.concatenate(rates, axis=1), seed))
 
 
-def by_score(rows: list[Row]) -> dict[str, Row]:
+def by_score(rows: list[ComparedScore]) -> dict[str, ComparedScore]:
     return {row.score: row for row in rows}
 
 
