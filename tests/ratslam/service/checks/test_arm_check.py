@@ -13,7 +13,7 @@ from ratslam.service.robot_check import RobotReport, RobotRequest, check_arm, ch
 from robot.drivers.head.usb_protocol import frame_values
 from robot.emulators.ur10.emulator_config import WallConfig
 from robot.live import live_rig
-from robot.live.arm_bench import FreeWhisks, record_of_text, record_to_text
+from robot.live.arm_bench import FreeWhisks, poke_in_air, record_of_text, record_to_text
 from robot.live.arm_route import arm_routes, plan_path
 from robot.live.live_config import LiveConfig
 from robot.live.live_emulator_config import arm_emulator_config
@@ -267,6 +267,15 @@ def test_an_emulated_arm_is_checked(loopback, tmp_path):
     with ExitStack() as stack:
         config, settings, (arm,) = emulated(stack, loopback, tmp_path, "live_poke", ["ur10"], settings)
         report = check_arm(RobotRequest(config, settings, NO_MARKS), trials=2)
+        assert not arm.state()["moving"]
+        live = load_config(config, settings).live
+
+        def strike(text):
+            if "pokes" in text:
+                arm(do="protective")
+
+        with pytest.raises(InputError, match="protective_stop"):
+            poke_in_air(live, HeadConfig(), PokeConfig(**POKES), lambda: False, strike, 2)
         assert not arm.state()["moving"]
     named = found(report.verdicts)
     del named["states"]  # of a busy machine
