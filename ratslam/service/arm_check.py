@@ -41,19 +41,19 @@ def judge_arm(live: LiveConfig, touch: TouchConfig, record: FreePokes) -> tuple[
     whole = record.states * (~met) >= SHORTEST * arm.hz
     push = [part for part, free in zip(record.each(record.push), whole, strict=True) if free]
     quantities: list[Quantity] = []
-    rig = Rig()
+    unknown: tuple[str, ...] = ()
     if arm.touch == "head":
-        rig = Rig(unknown=("whiskers: `check robot head` measures them",))
+        unknown = ("whiskers: `check robot head` measures them",)
     elif not push:
         verdicts.append(Verdict("force", "cannot tell", f"no poke lasted {SHORTEST:g} s without a contact"))
     else:
-        verdict, quantities, rig = _judge_force(pokes, push, arm.hz, arm.force_limit)
+        verdict, quantities = _judge_force(pokes, push, arm.hz, arm.force_limit)
         verdicts.append(verdict)
     robot, host = record.each(record.robot), record.each(record.host)
     rate = float(np.median([(len(part) - 1) / np.ptp(part) for part in host if len(part) > 1]))
     found = "fine" if rate >= MIN_RATE_SHARE * arm.hz else "slow stream"
     verdicts.append(Verdict("states", found, f"{rate:.0f} of {arm.hz} states/s"))
-    jitter = np.concatenate([b - a - (b - a).min() for a, b in zip(robot, host, strict=True)])
+    jitter = np.concatenate([b - a - (b - a).min() for a, b in zip(robot, host, strict=True) if len(a)])
     middle, most = np.quantile(record.ages, (0.5, 0.99))
     late = f"newest state {1e3 * middle:.0f} ms old, 99 % less than {1e3 * most:.0f}"
     late += f"; 99 % arrive less than {1e3 * np.quantile(jitter, 0.99):.0f} ms late"
@@ -66,14 +66,15 @@ def judge_arm(live: LiveConfig, touch: TouchConfig, record: FreePokes) -> tuple[
         Quantity("age of states, 99 %", None, float(most), None, "s"),
         Quantity("position after a poke, rms", None, float(np.sqrt((record.back**2).mean())), None, "m"),
     ]
-    nothing = () if rig.settings else ("nothing has to be set",)
-    return verdicts, rig._replace(quantities=tuple(quantities), notes=rig.notes + nothing)
+    fine = all(verdict.found == "fine" for verdict in verdicts)
+    notes = ("nothing has to be set",) if fine else ()
+    return verdicts, Rig(tuple(quantities), notes=notes, unknown=unknown)
 
 
 def _judge_force(
     pokes: PokeConfig, push: list[np.ndarray], hz: int, limit: float
-) -> tuple[Verdict, list[Quantity], Rig]:
-    """The verdict on the force [T] along each poke, N, its quantities, and the setting that follows."""
+) -> tuple[Verdict, list[Quantity]]:
+    """The verdict on the force [T] along each poke, N, and its quantities, with the setting that follows."""
     noise = float(np.median([estimate_noise(part) for part in push]))
     block = round(SMOOTH * hz)
     means = [part[: len(part) // block * block].reshape(-1, block).mean(axis=1) for part in push]
@@ -89,17 +90,16 @@ def _judge_force(
     try:
         threshold = learn_threshold(pokes, push, hz, limit)
     except InputError as error:
-        sds = max(LEAST_SDS, (MARGIN * highest - middle) / sd)
+        sds = max(LEAST_SDS, (MARGIN * highest - middle) / max(sd, 1e-9))
         if middle + sds * sd > HIGHEST * limit:
             cure = "check the payload and the tool on the pendant, or poke more slowly (`touch.pokes.speed`)"
-            return Verdict("force", "too uneven", f"{error.found}; {most}; {cure}"), quantities, Rig()
+            return Verdict("force", "too uneven", f"{error.found}; {most}; {cure}"), quantities
         # The force has no outliers: a lower threshold is still above all of its rises.
         detail = f"{error.found}; {most}; {sds:.1f} sds do, {MARGIN:g} times the highest rise or more"
-        sds_setting = Quantity("sds", pokes.sds, sds, None, "", "touch.pokes.sds")
-        settings = {"touch": {"pokes": {"sds": float(f"{sds:.3g}")}}}
-        return Verdict("force", "too uneven", detail), [*quantities, sds_setting], Rig(settings=settings)
+        quantities.append(Quantity("sds", pokes.sds, sds, None, "", "touch.pokes.sds"))
+        return Verdict("force", "too uneven", detail), quantities
     quantities.append(Quantity("threshold of a contact", None, threshold, None, "N"))
-    return Verdict("force", "fine", f"a rise of {threshold:.1f} N is a contact; {most}"), quantities, Rig()
+    return Verdict("force", "fine", f"a rise of {threshold:.1f} N is a contact; {most}"), quantities
 
 
 def judge_head(live: LiveConfig, touch: TouchConfig, record: FreeWhisks) -> tuple[list[Verdict], Rig]:
