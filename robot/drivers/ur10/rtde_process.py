@@ -117,10 +117,11 @@ class CommandThread:
             self._feel(self._poke, state)
 
     def _feel(self, poke: _Poke, state: np.ndarray) -> None:
-        """Stops a poke at a contact, seen from a new state (ARM_STATE)."""
+        """Stops a poke at a contact, seen from a new state (ARM_STATE): the force rises, along the way or, at
+        an edge that the tool grazes, across it."""
         states = self.shared.since(max(poke.first, self.shared.newest - poke.longest) - 1)
         push = -states["force"][:, :3] @ poke.along
-        rise = force_rise(poke.config, push, self.config.hz)[-1]
+        rise = np.hypot(*force_rise(poke.config, states["force"][:, :2].T, self.config.hz)[:, -1])
         if rise > poke.threshold or is_loaded(push, self.config.force_limit)[-1]:
             self._poke = None
             self.stop()
