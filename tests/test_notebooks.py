@@ -10,7 +10,7 @@ import pytest
 from tests.helpers.commands import ROOT
 
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
-LESS = {"SECONDS": 90, "SESSIONS": 4}
+LESS = {"SECONDS": 60, "SESSIONS": 4}
 """Amounts of data, instead of those that the notebooks set."""
 
 
