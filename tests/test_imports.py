@@ -192,7 +192,7 @@ for name in names:
     importlib.import_module(name)
 after = dict(jax.config.values), dict(os.environ)
 for _, environment in (before, after):
-    environment.pop("KMP_DUPLICATE_LIB_OK", None)  # of threadpoolctl, which Dask loads if it is there
+    environment.pop("KMP_DUPLICATE_LIB_OK", None)  # of threadpoolctl, which scipy.io loads if it is there
 print(json.dumps([len(names) > 5, before == after]))
 """
     done = started(code)
