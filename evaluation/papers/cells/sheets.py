@@ -247,7 +247,7 @@ def _draw_sheets(result: _Result, png: Path) -> None:
             bins = np.linspace(-1.0, 1.6, 53).tolist()
             panel.hist(known, bins, color=COLOURS[way], alpha=0.6, label=way, density=True)
         name_panel(panel, "", f"grid score, {path}", "density")
-    style.add_legend(figure, panel, columns=3).savefig(png)
+    style.add_legend(figure, panels[0], columns=3).savefig(png)
 
 
 FIGURE = Figure("Hexagons from a twisted sheet", measure_sheets, _table_sheets, _draw_sheets)
