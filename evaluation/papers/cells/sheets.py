@@ -239,9 +239,8 @@ def _draw_sheets(result: _Result, png: Path) -> None:
                 axes = style.add_axes(figure, style.LEFT + column * (wide + GAP), top, wide, up)
                 axes.imshow(values, origin="lower", aspect="auto", **how)
                 axes.set(xticks=[], yticks=[])
-    for panel, (path, ways) in zip(
-        panel_row(figure, len(result), 0.6, LOW, HIGH), result.items(), strict=True
-    ):
+    panels = panel_row(figure, len(result), 0.6, LOW, HIGH)
+    for panel, (path, ways) in zip(panels, result.items(), strict=True):
         for way, found in ways.items():
             known = found.hexagonal.score[np.isfinite(found.hexagonal.score)]
             bins = np.linspace(-1.0, 1.6, 53).tolist()
