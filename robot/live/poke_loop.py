@@ -16,6 +16,7 @@ from robot.live.live_rig import ArmRig
 from robot.live.polling import TICK, AsyncMapper, check_mapper
 from robot.live.whisk_loop import advance_route, refusal
 from robot.sources.source import Sample
+from tactile.base.errors import InputError
 from tactile.base.se2 import between, wrap
 from tactile.pokes import TURN_LENGTH, PokeConfig, learn_threshold, poke_angles, poke_observation
 
@@ -94,9 +95,15 @@ def learn_free_pokes(rig: ArmRig, pokes: PokeConfig) -> float:
     """Pokes in free air, once in each direction; returns the threshold of the rise, N.
 
     Raises:
-        InputError: the force is too uneven. robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
+        InputError: there was a contact, or the force is too uneven. robot.live.polling.SessionFault,
+            robot.live.polling.OperatorStop.
     """
     record, arm = record_free_pokes(rig, pokes), rig.config.arm
+    for angle, way in zip(np.degrees(record.angle), record.touched, strict=True):
+        if np.isfinite(way):
+            found = f"a contact in free air, {way:.3f} m towards {angle:.0f} degrees in the base frame"
+            expected = f"{pokes.reach:g} m of free air around the tool above the start"
+            raise InputError("live.lift", found, expected, "clear the way, or raise the lift")
     return learn_threshold(pokes, record.each(record.push), arm.hz, arm.force_limit)
 
 

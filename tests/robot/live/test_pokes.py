@@ -293,3 +293,11 @@ def test_a_fault_of_the_arm_while_it_pokes_is_named(monkeypatch, fault, outcome)
         run_poke_loop(rig, route, _Offered(), QUICK, threshold, reports.append)
     assert ended.value.fault.outcome is outcome
     assert len(reports) == 1
+
+
+def test_a_contact_in_free_air_is_named(monkeypatch):
+    rig, _, _, _ = session_of(monkeypatch, QUICK, "C", 1)
+    x = float(rig.arm.latest()["tcp"][0])
+    rig.arm.controller.arm.walls.append(WallConfig(axis="x", at=x + 0.03))
+    with rig, pytest.raises(InputError, match=r"a contact in free air, 0\.03\d m towards"):
+        learn_free_pokes(rig, QUICK)
