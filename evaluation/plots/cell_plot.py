@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.cells.cell_comparison import ComparedScore
 from evaluation.cells.information import information
 from evaluation.cells.rate_map import known_poses, rate_maps, recorded_sums, tuning_curves
 from evaluation.cells.recording import BinnedSums, CellRecording
 from evaluation.plots import style
 from evaluation.plots.style import BLUE, GREY, INK, LABEL_GREY, VERMILLION
 from tactile.base.errors import InputError
+
+if TYPE_CHECKING:  # it loads parts of SciPy that a run needs late or never
+    from evaluation.cells.cell_comparison import ComparedScore
 
 MOST = 12
 """Largest number of cells in a plot of a run."""
