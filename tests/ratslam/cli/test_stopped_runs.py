@@ -76,21 +76,21 @@ def test_an_interrupted_run_is_scored_and_continues(corridor, tmp_path):
 def test_an_interrupt_is_not_lost_in_the_garbage_collector(monkeypatch):
     """Python prints what callbacks of the collector raise (JAX has one) and goes on."""
 
-    presses = iter(range(3))
+    def collect(times):
+        presses = iter(range(times))
 
-    def interrupt(*_):
-        if next(presses, None) is not None:
-            signal.raise_signal(signal.SIGINT)
+        def interrupt(*_):
+            if next(presses, None) is not None:
+                signal.raise_signal(signal.SIGINT)
 
-    def collect():
         gc.callbacks.append(interrupt)
         gc.collect(0)  # calls it twice
         gc.callbacks.remove(interrupt)
         time.sleep(10)
 
     with pytest.raises(KeyboardInterrupt), catch_interrupt("ending"):
-        collect()
-    monkeypatch.setattr(Program, "parse_args", lambda *_: Namespace(command=lambda _: collect()))
+        collect(2)
+    monkeypatch.setattr(Program, "parse_args", lambda *_: Namespace(command=lambda _: collect(1)))
     assert main(["run"]) == 130
 
 

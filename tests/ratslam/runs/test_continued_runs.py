@@ -101,7 +101,7 @@ def expected(monday: Path) -> SavedMap:
 def test_warnings_about_the_input_go_with_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of readers and of the judge of motion, those of the map first, each once."""
     told = iter((["a gap"], ["a gap", "a jump"]))
-    found: list[tuple[np.ndarray, np.ndarray, str]] = []
+    found: list[tuple[np.ndarray, np.ndarray, str, float]] = []
     monkeypatch.setattr(ratslam.runs.runner, "judge_motion", lambda *args: found.append(args) or next(told))
     for name, source, resume, wanted in (
         ("a", first(), None, ["cut off", "a gap"]),
@@ -113,8 +113,8 @@ def test_warnings_about_the_input_go_with_the_map(tmp_path: Path, monkeypatch: p
         result = ratslam.Result(tmp_path / name)
         assert list(result.warnings) == list(result.scorecard.health.warnings) == wanted
         assert result.health.input == "warned"
-    time, motion, where = found[1]
-    assert where == "tuesday"
+    time, motion, where, interval = found[1]
+    assert (where, interval) == ("tuesday", 0.0)
     np.testing.assert_array_equal(time, second().time)
     np.testing.assert_allclose(motion[:, :3], second().motion[:, :3], atol=1e-12)
     np.testing.assert_allclose(motion[1:, 3], np.diff(time))
