@@ -117,6 +117,9 @@ class PokeSimulation(SimulatedSource):
         self.config, self.pokes = config, pokes
         self.whiskers, self.view_shape = pokes.directions, (1, pokes.directions, 1)
         seed, head = config.seed, ur10_head(HeadConfig())
+        if config.raw or config.fidelity != "auto" or config.mechanics.baseline.is_on:
+            found = "force, with settings of whiskers (raw, fidelity or mechanics.baseline)"
+            raise InputError("simulation.touch", found, "none of them: pokes have no whiskers")
         scene = make_scene(config.maze, config.path, config.motion, config.kidnaps, head, seed)
         moved = ring_times(scene.path, pokes.every, min(scene.duration, scene.path.duration))
         check_steps("simulation", len(moved))

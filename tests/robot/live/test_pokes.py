@@ -118,6 +118,8 @@ def test_simulated_pokes_touch_walls_and_nothing_else(stiffness):
 
 def test_a_simulated_session_is_drawn_from_its_seed():
     config = SimulationConfig(touch="force", path={"circuits": "C"}, seed=3)
+    with pytest.raises(InputError, match="pokes have no whiskers"):
+        PokeSimulation(config.model_copy(update={"raw": True}), QUICK)
     once, again, other = (PokeSimulation(config.model_copy(update={"seed": k}), QUICK) for k in (3, 3, 4))
     assert once.digest == again.digest != other.digest
     first, second = list(once), list(again)
