@@ -90,8 +90,12 @@ def test_an_interrupt_is_not_lost_in_the_garbage_collector(monkeypatch):
 
     with pytest.raises(KeyboardInterrupt), catch_interrupt("ending"):
         collect(2)
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)  # programs in the background ignore it
     monkeypatch.setattr(Program, "parse_args", lambda *_: Namespace(command=lambda _: collect(1)))
-    assert main(["run"]) == 130
+    try:
+        assert main(["run"]) == 130
+    finally:
+        signal.signal(signal.SIGINT, usual)
 
 
 def check_killed_run(whole, directory):
