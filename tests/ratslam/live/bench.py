@@ -152,16 +152,19 @@ class CreateBench:
     """An emulated Create at an address: its serial port, a link, and faults of its whiskers' bridge."""
 
     whiskers: Faults
+    model = "create1"
 
     def __init__(self, host: str, server: SessionServer, folder: Path) -> None:
         self.host, self.port, self._server, self._stack = host, folder / "create.tty", server, ExitStack()
 
-    def ready(self) -> None:
-        """Clears the faults of the robot and plugs it in."""
-        if not self.runs():
+    def ready(self, model: str = "create1") -> None:
+        """Clears the faults of a robot of this model and plugs it in."""
+        if not self.runs() or model != self.model:
             self.close()
+            self.model = model
             world = {"arena": PLAN["arena"], "wheels": PLAN["wheels"], "bridge": {"host": self.host}}
-            config = json.dumps({"port": str(self.port), "seed": PLAN["seed"], "world": world})
+            robot = {"port": str(self.port), "seed": PLAN["seed"], "firmware": {"model": model}}
+            config = json.dumps(robot | {"world": world})
             command = ["-m", "robot.emulators.create", "--config", config]
             self.whiskers = self._stack.enter_context(started(command, HEAD_FAULTS, self.host))
         self.robot("clear")
