@@ -22,8 +22,6 @@ from tactile.pokes import TURN_LENGTH, PokeConfig, learn_threshold, poke_angles,
 
 LONGEST_REST = 2.0
 """Time at rest on a route that waits after which a ring is poked again, s."""
-
-
 SHARES = (1.0, 0.8, 0.6, 0.4, 0.2)
 """Shares of the way of a poke that are tried, if the arm has no joints for its end."""
 
@@ -124,10 +122,10 @@ def run_poke_loop(
         robot.live.polling.SessionFault, robot.live.polling.OperatorStop.
     """
     number, most, arrived = 0, rig.config.whisks, False
-    while number != most:
+    while True:
         tell(_poke_ring(rig, mapper, pokes, threshold))
         number += 1
-        if arrived:
+        if arrived or number == most:
             return
         arrived = _move_on(rig, route, mapper, pokes.every)
 

@@ -25,8 +25,10 @@ from robot.simulation.head.simulated_pokes import PokeSimulation, feel, simulate
 from robot.simulation.head.simulated_session import SimulationConfig
 from robot.sources.source import SourceDescription
 from robot.world.contact_force import ContactForceConfig, force_error, free_way, wall_distance
+from robot.world.maze import table_maze
 from tactile.base.errors import InputError
 from tactile.base.types import Odometry
+from tactile.frontend import TouchConfig, touched_points
 from tactile.pokes import PokeConfig, force_rise, is_loaded, learn_threshold, poke_angles, poke_observation
 from tactile.whisker_geometry import HeadConfig, ur10_head
 from tests.helpers.virtual_arm import VirtualArm, in_virtual_time
@@ -304,3 +306,45 @@ def test_a_contact_in_free_air_is_named(monkeypatch):
     rig.arm.controller.arm.walls.append(WallConfig(axis="x", at=x + 0.03))
     with rig, pytest.raises(InputError, match=r"a contact in free air, 0\.03\d m towards"):
         learn_free_pokes(rig, QUICK)
+
+
+def test_a_poke_whose_end_the_arm_cannot_reach_goes_less_far(monkeypatch):
+    rig, route, _, _ = session_of(monkeypatch, QUICK, "C", 1)
+    arm, reports = rig.arm, []
+    centre, reached = arm.latest()["tcp"].copy(), []
+
+    def within(target):
+        near = np.linalg.norm(np.subtract(target, centre)[:3]) < 0.06
+        reached.append(near)
+        return near
+
+    monkeypatch.setattr(arm.commands.control, "isPoseWithinSafetyLimits", within)
+    with rig:
+        run_poke_loop(rig, route, _Offered(), QUICK, float("inf"), reports.append)
+        assert np.linalg.norm((arm.latest()["tcp"] - centre)[:3]) < 0.002
+    assert arm.fault is None
+    assert len(reports) == 1
+    assert not reports[0].contact.any()
+    assert reached.count(False) == 2 * 4  # the whole way and four fifths of it are too far, three fifths not
+
+
+def test_points_of_an_image_are_where_the_tool_met_the_walls():
+    config = TouchConfig()
+    depth, contact = np.linspace(0.03, 0.25, 6), np.arange(6) % 2 == 0
+    seen = poke_observation(config.pokes, depth, contact, Odometry(0.0, 0.0, 0.0, 0.0))
+    points, there = touched_points(config, seen.view[0, :, 0])
+    assert np.array_equal(there, contact)
+    half_a_bin = config.pokes.reach / config.pokes.bins / 2
+    assert np.abs(np.linalg.norm((points - seen.point)[contact], axis=1)).max() <= half_a_bin + 1e-9
+
+
+@given(st.integers(2, 8), st.integers(2, 8), st.floats(0, 0.6), st.integers(0, 99))
+def test_every_free_cell_of_a_table_can_be_reached(columns, rows, share, seed):
+    maze = table_maze(columns, rows, share, np.random.default_rng(seed))
+    cells = [(x, y) for y in range(rows) for x in range(columns)]
+    free = [cell for cell in cells if maze.neighbours(cell)]
+    reached = [(0, 0)]
+    for cell in reached:
+        reached += [b for b in maze.neighbours(cell) if b not in reached]
+    assert set(reached) == set(free) | {(0, 0)}
+    assert len(cells) - len(reached) <= share * len(cells) + 1

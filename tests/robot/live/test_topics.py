@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.drivers.outcome import SessionOutcome
+from robot.live import topics_rig
 from robot.live.live_config import LiveConfig, TopicsLiveConfig
 from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
@@ -501,3 +503,19 @@ def test_a_mapper_that_lags_drops_views_and_no_motion(loopback):
     assert sum(float(s.reading.odometry.dtheta) for s in session.mapper.samples) == pytest.approx(
         total, abs=1e-9
     )
+
+
+def test_time_in_which_the_session_itself_stood_still_is_no_silence_of_the_robot(loopback, monkeypatch):
+    clock = SimpleNamespace(monotonic=lambda: now[0], time=time.time, process_time=time.process_time)
+    with session_on(PlainBridge(loopback, KINDS), patience=3.0) as session:
+        now = [time.monotonic()]
+        monkeypatch.setattr(topics_rig, "time", clock)
+        session.rig.begin()
+        now[0] += 100.0  # behind a pipe that nobody reads, say
+        session.rig.check_patience()
+        for _ in range(4):
+            now[0] += 0.7
+            session.rig.check_patience()
+        now[0] += 0.7
+        with pytest.raises(SessionFault, match="no message for 3 s"):
+            session.rig.check_patience()
