@@ -44,7 +44,7 @@ def lines(output):
 
 def start_study(study, output, *more, records):
     process = start("study", study, "-o", output, *more)
-    wait_until(lambda: len(lines(output)) >= records, process)
+    wait_until(lambda: sum(line.endswith(b"\n") for line in lines(output)) >= records, process)
     return process
 
 
