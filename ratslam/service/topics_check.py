@@ -132,7 +132,7 @@ def _part(setting: Any) -> dict[str, Any]:
 def _with_values(
     part: dict[str, Any], described: dict[str, TopicDescription], odometry: str
 ) -> dict[str, Any]:
-    """The settings of views, with values for what would be learned from a whole recording."""
+    """The settings of views or touch, with values for what would be learned from a whole recording."""
     topic, steps = described[part["topic"]], described[odometry]
     clock = steps.stamped or steps.received
     if clock.rate_hz:
@@ -141,6 +141,8 @@ def _with_values(
         part["max_range"] = float(f"{min(topic.shape.high, LONGEST):.6g}")
     elif topic.kind == CLOUD:
         part["max_range"] = LONGEST
+    elif "touch" in topic.roles and topic.shape is not None:
+        part["rows"], part["columns"] = (1, *topic.shape.size)[-2:]
     return part
 
 

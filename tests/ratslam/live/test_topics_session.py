@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -212,6 +212,52 @@ def test_the_map_of_a_session_is_that_of_the_file_and_of_its_recording(
     maps_of_file(tmp_path / "live", config, bag, tmp_path / "file")
     closures = (tmp_path / "again" / "closures.csv").read_text().splitlines()
     assert len(closures) > 1  # the second round is recognised
+
+
+BEAMS = {"side_left": 81, "left": 71, "front_left": 65, "front_right": 54, "right": 47}
+"""Directions of proximity sensors of a Create 3, as beams of a scan of `rounds`."""
+
+
+def touched(entry: Entry) -> list[Entry]:
+    """What a Create 3 feels where `rounds` has a scan: it bumps into something where the wall before it is
+    nearer than 1.6 m."""
+    away, first = entry.fields["ranges"], entry.fields["header"]
+    kind = "irobot_create_msgs/msg/{}Vector".format
+
+    def named(frame: str, **fields: int) -> dict[str, Any]:
+        return {"header": first | {"frame_id": frame}} | fields
+
+    readings = [named(f"ir_{name}", value=int(2000 / (1 + away[beam]))) for name, beam in BEAMS.items()]
+    bumps = [named("bump_front_center", type=1)] if away[60] < 1.6 else []
+    return [
+        Entry("/ir", kind("IrIntensity"), entry.time, {"header": first, "readings": readings}),
+        Entry("/bumps", kind("HazardDetection"), entry.time, {"header": first, "detections": bumps}),
+    ]
+
+
+@pytest.mark.parametrize("touch", ["/ir", "/bumps"])
+def test_a_create_3_is_mapped_by_what_it_touches(touch, loopback, tmp_path, capsys):
+    entries = [
+        new
+        for entry in rounds(1.3)
+        for new in ([entry] if entry.topic == "/odom" else touched(entry))
+        if new.topic in ("/odom", touch)
+    ]
+    kinds = {entry.topic: entry.kind for entry in entries}
+    robot, config = PlainBridge(loopback, kinds), tmp_path / "robot.yaml"
+    try:
+        player = Player(robot, written(entries), 1.0, endless=True)
+        said(capsys, "topics", robot.address, "-o", config, "--seconds", "2")
+        player.done.set()
+        report = session(robot, config, tmp_path / "live", written(entries), 10.0)
+    finally:
+        robot.close()
+    touches = sum(entry.topic == touch for entry in entries)
+    assert report["messages"] == {"/odom": len(entries) - touches, touch: touches}
+    assert report["views"] >= touches - 1
+    maps_alike(tmp_path / "live", tmp_path / "again")
+    bag = write_bag(tmp_path, "mcap", entries)
+    maps_of_file(tmp_path / "live", config, bag, tmp_path / "file")
 
 
 def configured(folder: Path, address: str) -> Path:
