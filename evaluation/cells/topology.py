@@ -24,7 +24,7 @@ NEIGHBOUR, DENSE = 20, 0.9
 
 
 class Holes(NamedTuple):
-    """Lifetimes of the holes of a population, in units of its activity, longest first.
+    """Lifetimes of the holes of a population, between states of length 1, longest first.
 
     Attributes:
         loops: [n] one-dimensional. voids: [m] two-dimensional.
@@ -37,8 +37,10 @@ class Holes(NamedTuple):
 def find_holes(activity: np.ndarray) -> Holes:
     """The holes of the states [T, C] of C cells.
 
-    Of `STATES` states in the space of the first principal components the densest are kept, because few wrong
-    ones fill a hole, and of these the `LANDMARKS` that are farthest from each other.
+    Of `STATES` states the directions in the space of the first principal components, each of variance 1, are
+    compared: the three waves of a torus of grid cells then count alike, and a packet that is wide and low is
+    the state of a narrow one. The densest are kept, because few wrong ones fill a hole, and of these the
+    `LANDMARKS` that are farthest from each other.
 
     Raises:
         InputError: ripser is not installed, or there are too few states.
@@ -53,7 +55,8 @@ def find_holes(activity: np.ndarray) -> Holes:
         raise InputError("activity", f"{len(rows)} states", f"at least {round(LANDMARKS / DENSE)}")
     states = np.asarray(activity[rows], np.float64)
     states -= states.mean(axis=0)
-    states = states @ np.linalg.svd(states, full_matrices=False)[2][:COMPONENTS].T
+    states = np.linalg.svd(states, full_matrices=False)[0][:, :COMPONENTS]  # of equal variance
+    states /= np.linalg.norm(states, axis=1, keepdims=True)
     sparse = np.sort(cdist(states, states), axis=1)[:, NEIGHBOUR]
     states = states[np.argsort(sparse, kind="stable")[: round(DENSE * len(states))]]
     chosen, apart = [0], cdist(states[:1], states)[0]

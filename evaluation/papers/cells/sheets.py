@@ -67,7 +67,7 @@ class _Sheets(NamedTuple):
 
     Attributes:
         hexagonal, square: lattice scores [n * C] and their shuffles. error: [n] root mean square of
-            `sheet_errors`, spacings. maps: [C, H, W] of the first session. holes: of its second half, then of
+            `sheet_errors`, spacings. maps: [C, H, W] of the first session. holes: its own, then of
             shuffles; of the twisted sheet alone, and not without ripser.
     """
 
@@ -105,8 +105,7 @@ def _measure(task: Task, path: str, way: str, cells: int, shuffles: int, seconds
         active = recording.activity
         found.append(measure_cells(recording, active, box, bin, shuffles, seed, 1.5 * bin))
         if way == TWISTED and seed == task.first and find_spec("ripser"):
-            later = active[len(active) // 2 :]
-            holes = [find_holes(later), *shuffled_holes(later, len(later) / seconds * 2, HOLE_SHUFFLES, seed)]
+            holes = [find_holes(active), *shuffled_holes(active, len(active) / seconds, HOLE_SHUFFLES, seed)]
         errors.append(np.sqrt(np.mean(sheet_errors(recording, spacing) ** 2)) / spacing)
     hexagonal, square = (
         ShuffledScores(
