@@ -26,10 +26,9 @@ from robot.live.live_rig import ArmRig, Rig
 from robot.live.poke_loop import PokeReport, learn_free_pokes, run_poke_loop
 from robot.live.polling import SessionFault, session_fault
 from robot.live.whisk_loop import WhiskReport, follow_route, record_free_whisks, run_whisk_loop
-from robot.simulation.head.simulated_pokes import moved_length
 from robot.sources.source import SourceDescription, SourceInfo
 from robot.world.maze import POSE_CELL_SIZE
-from robot.world.scene import HeadPath, maze_info
+from robot.world.scene import HeadPath, maze_info, moved_length
 from tactile.calibration import Calibration, calibrate
 from tactile.whisker_geometry import ur10_head
 from tactile.whisker_image import view_shape

@@ -38,6 +38,7 @@ from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.se2 import wrap
 from tactile.base.settings import Settings
+from tactile.pokes import TURN_LENGTH
 from tactile.whisker_geometry import Head, tip_height
 
 
@@ -109,6 +110,13 @@ def poses_at(path: HeadPath, time: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(time, path.time, path.pose[:, k]) for k in range(3)], axis=-1)
 
 
+def moved_length(path: HeadPath) -> np.ndarray:
+    """Way [K] of the arm up to each pose of a path, m; turns count too."""
+    step = np.abs(np.diff(path.pose, axis=0))
+    way = np.hypot(step[:, 0], step[:, 1]) + TURN_LENGTH * step[:, 2]
+    return np.concatenate([[0.0], np.cumsum(way)])
+
+
 def add_kidnaps(path: HeadPath, at_times: Sequence[float], ahead: float) -> tuple[HeadPath, np.ndarray]:
     """The path with kidnaps: at each of these times the head jumps to its pose `ahead` s later.
 
@@ -134,7 +142,7 @@ def add_kidnaps(path: HeadPath, at_times: Sequence[float], ahead: float) -> tupl
 PAPER_CIRCUITS = "CCCAAACACA"
 """Circuits of the protocol of Salman & Pearson 2016, III-C."""
 POSE_STEP = 0.005
-"""Distance between the poses at which whiskers at rest must be free, m; a turn of 1 rad counts as 10 cm."""
+"""Distance between the poses at which whiskers at rest must be free, m; turns count too."""
 
 
 class MazeConfig(Settings):
@@ -279,7 +287,7 @@ def _check_surroundings(boxes: Walls, head: Head, path: HeadPath) -> Surrounding
         return surroundings  # at rest, whiskers are above all walls
     # Times (s) along a path with a motion of at most `POSE_STEP` in between.
     step = np.abs(np.diff(path.pose, axis=0))
-    parts = np.ceil((np.hypot(step[:, 0], step[:, 1]) + 0.1 * step[:, 2]) / POSE_STEP)
+    parts = np.ceil((np.hypot(step[:, 0], step[:, 1]) + TURN_LENGTH * step[:, 2]) / POSE_STEP)
     parts = np.maximum(parts, 1).astype(int)
     ends = zip(path.time[:-1], path.time[1:], parts, strict=True)
     time = np.concatenate([*(np.linspace(a, b, n, endpoint=False) for a, b, n in ends), path.time[-1:]])

@@ -25,12 +25,11 @@ from robot.sources.in_memory import (
 from robot.sources.source import SimulationInfo, SourceInfo, rate_of
 from robot.world.contact_force import ContactForceConfig, force_error, free_way
 from robot.world.maze import POSE_CELL_SIZE, maze_text
-from robot.world.scene import HeadPath, make_scene, maze_info, other_surroundings, poses_at
+from robot.world.scene import HeadPath, make_scene, maze_info, moved_length, other_surroundings, poses_at
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 from tactile.base.types import Observation
 from tactile.pokes import (
-    TURN_LENGTH,
     PokeConfig,
     force_rise,
     is_loaded,
@@ -46,13 +45,6 @@ REST = 0.1
 """Time at rest before a poke, s."""
 CHUNK = 64
 """Rings simulated at a time."""
-
-
-def moved_length(path: HeadPath) -> np.ndarray:
-    """Way [K] of the arm up to each pose of a path, m; turns count too."""
-    step = np.abs(np.diff(path.pose, axis=0))
-    way = np.hypot(step[:, 0], step[:, 1]) + TURN_LENGTH * step[:, 2]
-    return np.concatenate([[0.0], np.cumsum(way)])
 
 
 def ring_times(path: HeadPath, every: float, duration: float) -> np.ndarray:
