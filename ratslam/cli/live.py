@@ -145,6 +145,9 @@ def _emulate(arguments: argparse.Namespace) -> int:
         found = "that of a Create" if session.create else "that of an arm"
         cure = "the packaged `live_create` is for `create`, `live_maze` for `ur10` and `head`"
         raise InputError(f"{arguments.config}: live", found, f"one for `{arguments.device}`", cure)
+    if arguments.device == "head" and session.arm.touch == "force":
+        found = "force: this arm has no head"
+        raise InputError("live.arm.touch", found, "head", "emulate `ur10`, which feels the walls itself")
     try:
         if session.create is not None:
             from robot.emulators.create import serve as serve_create
