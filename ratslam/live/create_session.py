@@ -1,4 +1,4 @@
-"""A live session on a whiskered Create: self-test, exploration by the state machine, reports."""
+"""A live session on a Create with whiskers or light bumpers: self-test, exploration by the state machine."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ import numpy as np
 from ratslam.live.live_robot import LiveRobot, mapped_config, mapper_status
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
-from robot.live.create_rig import CreateRig, run_create_loop
+from robot.drivers.create.protocol import LIGHTS
+from robot.live.create_rig import CreateRig, open_create, run_create_loop
+from robot.live.polling import HeadRig
 from robot.recordings.cdr import doubts_of
 from robot.simulation.create.simulated_session import describe_create
 from robot.simulation.create.state_machine import CreateState
-from robot.sources.source import SourceDescription
+from robot.sources.source import PlanarWhiskersInfo, SourceDescription
 from robot.world.arena import make_arena, wall_segments
 from tactile.base.errors import InputError
 from tactile.base.se2 import between
@@ -33,11 +35,13 @@ def prepare_create_session(
     """Checks that the method maps what a Create reports; returns the function that opens the devices.
 
     Raises:
-        InputError: the backend needs views, which a Create does not have.
+        InputError: the backend needs views, which whiskers of a Create do not make.
     """
-    if config.backend in ("recall", "classic"):
+    assert config.live is not None
+    assert config.live.create is not None
+    if config.backend in ("recall", "classic") and config.live.create.touch == "whiskers":
         found = f"{config.backend}, which recognises views"
-        expected = "a method that maps contacts, such as `grid`: a Create has no views"
+        expected = "a method that maps contacts, such as `grid`: these whiskers make no views"
         raise InputError("backend", found, expected, "--set backend=grid")
     return lambda stopped: CreateSession(config, directory, stopped)
 
@@ -51,12 +55,16 @@ class CreateSession(LiveRobot):
     def __init__(self, config: RunConfig, directory: Path, stopped: Callable[[], bool]) -> None:
         assert config.live is not None
         assert config.live.create is not None
-        self.rig = CreateRig(config.live, stopped)
+        self.rig = open_create(config.live, stopped)
         plan = config.live.create.plan
         arena = make_arena(plan.arena, plan.seed)
         info = describe_create(plan, arena)
         live = config.live.model_dump(mode="json", exclude={"create": {"plan": {"arena": {"file"}}}})
-        whiskers = len(plan.whiskers.mounts)
+        if config.live.create.touch == "light":  # the bumper in the directions of these sensors
+            mounts = tuple((0.0, 0.0, angle) for angle in LIGHTS)
+            ring = PlanarWhiskersInfo(mounts=mounts, length=plan.behaviour.body)
+            info = info.model_copy(update={"raw_whiskers": False, "planar_whiskers": ring})
+        whiskers = len(self.rig.alive)
         ends = wall_segments(arena).reshape(-1, 2)
         seen = between(arena.start, np.column_stack([ends, np.zeros(len(ends))]))  # from the start
         info = info.model_copy(update={"provenance": {**info.provenance, "live": live}})
@@ -80,7 +88,8 @@ class CreateSession(LiveRobot):
             mapper.warn(doubts_of([] if self.rig.doubt is None else [self.rig.doubt]))
 
     def report(self) -> dict[str, Any]:
-        return super().report() | {
+        head = super().report() if isinstance(self.rig, HeadRig) else {}
+        return head | {
             "ends": {end.name.lower(): self._ends[end] for end in StepEnd},
             "alive": self.rig.alive.tolist(),
             "serial": self.rig.robot.counts._asdict(),

@@ -1,6 +1,6 @@
-"""A Create and its whiskers in a live session: the rig, the monitored strain, and the loop.
+"""A Create in a live session, with whiskers or by its light bumpers: the rigs, the monitors, and the loop.
 
-The loop runs the state machine of Fox et al. 2012 on the robot, each motion a report.
+The loop runs the state machine of Fox et al. 2012 on the robot, each motion a reading.
 """
 
 from __future__ import annotations
@@ -12,21 +12,35 @@ import numpy as np
 
 from robot.drivers.create.driver import CreateDriver
 from robot.drivers.create.driver_config import CommandRefused, StopReason
-from robot.drivers.create.protocol import Bumps
+from robot.drivers.create.protocol import LIGHTS, MOST_LIGHT, Bumps
 from robot.drivers.head.decoder import Frames
 from robot.drivers.head.device import open_bridge
 from robot.drivers.head.reader import HeadReader
 from robot.drivers.head.usb_protocol import to_radians
-from robot.drivers.outcome import SessionOutcome
+from robot.drivers.outcome import Fault, SessionOutcome
 from robot.live.live_config import LiveConfig
-from robot.live.polling import AsyncMapper, HeadRig, OperatorStop, SessionFault, check_mapper, session_fault
+from robot.live.polling import (
+    AsyncMapper,
+    HeadRig,
+    OperatorStop,
+    PolledRig,
+    SessionFault,
+    check_mapper,
+    session_fault,
+)
 from robot.recordings.cdr import Event
 from robot.simulation.create import state_machine
-from robot.simulation.create.state_machine import CreateState, MachineState, motion_end, next_state
+from robot.simulation.create.state_machine import (
+    BehaviourConfig,
+    CreateState,
+    MachineState,
+    motion_end,
+    next_state,
+)
 from robot.simulation.create.strain_sensors import fixed_whiskers
 from robot.sources.source import Sample
 from tactile.base.random_streams import stream
-from tactile.base.types import Odometry, Report, StepEnd
+from tactile.base.types import MotionKind, Observation, Odometry, Report, StepEnd, observation
 
 OUTCOMES = {
     StopReason.WHEEL_DROP: SessionOutcome.WHEEL_DROP,
@@ -43,40 +57,39 @@ MAX_READ_TIME = 1.0
 """Longest wait for a reading, s: the robot has another fault before."""
 
 
-class CreateRig(HeadRig):
-    """The robot and the whiskers of a session; a context manager that leaves the robot at rest.
+class CreateRig(PolledRig):
+    """A Create 2 that feels walls by its bumper and its light bumpers; a context manager that leaves it at
+    rest.
 
     Attributes:
-        create: settings of the robot. robot, head: the devices. monitor: strain of the whiskers. alive: [W]
-            bool, whiskers with a signal.
+        create: settings of the robot. robot: the device. monitor: of its touch. alive: [W] bool, sensors with
+            a signal.
     """
+
+    monitor: LightMonitor | StrainMonitor
 
     def __init__(self, config: LiveConfig, stopped: Callable[[], bool]) -> None:
         assert config.create is not None
+        PolledRig.__init__(self, config, stopped)
         self.create = config.create
-        plan = self.create.plan
-        fan = fixed_whiskers(plan.whiskers)
-        self.alive = fan.alive.copy()
         self.robot = CreateDriver(self.create)
-        reader = HeadReader(lambda: open_bridge(config.head.address), len(fan.base), config.head)
-        super().__init__(config, reader, stopped)
-        rate, period = plan.whiskers.rate, plan.behaviour.period
-        self.monitor = StrainMonitor(rate, period, self.create.strain_per_radian, len(fan.base))
-        self._connections = 0  # of the whiskers, seen so far
+        self.monitor, self.alive = LightMonitor(self.create.plan.behaviour), np.ones(len(LIGHTS), bool)
         self._free = self.epoch  # newest time at which the bumper was not pressed
         self.doubt: Event | None = None  # what speaks against the odometry
 
+    @property
+    def fault(self) -> Fault | None:
+        """The fault of what is read and written beside the robot, or None."""
+        return None if self.recorder is None else self.recorder.fault
+
+    @property
+    def connection(self) -> int | None:
+        """Number of the connection to the sensors; None while they are silent."""
+        return 0
+
     def poll(self) -> None:
-        """Reads the samples of the whiskers and the state of the robot; see `HeadRig`."""
-        for frames, arrival in self.stream.take():
-            if self.stream.restarts != self._connections:
-                self._connections = self.stream.restarts
-                self.monitor.restart()
-            if self.recorder is not None:
-                self.recorder.add_frames(frames, arrival - self.epoch)
-            self.monitor.add(frames)
-        fault = self.stream.fault or (self.recorder and self.recorder.fault)
-        stop = self.robot.active_stop
+        """Reads the state of the robot; see `PolledRig`."""
+        fault, stop = self.fault, self.robot.active_stop
         if stop is not None and stop.reason in OUTCOMES:
             detail = stop.detail
             if stop.reason is StopReason.UNPLUGGED:
@@ -100,6 +113,8 @@ class CreateRig(HeadRig):
         self.robot.odometry()
         self.robot.gap()
         self.epoch = self._free = time.monotonic()
+        if isinstance(self.monitor, LightMonitor):
+            self.record_event("light", str(self.monitor))
 
     @property
     def bumped(self) -> bool:
@@ -140,9 +155,127 @@ class CreateRig(HeadRig):
         motion = self.robot.odometry()
         return self.robot.counts.good > good and not any(motion[:3])
 
+    def reading(self, report: Report) -> Report | Observation:
+        """What is passed on of a motion: here the image of the light bumpers at its end and, of a pressed
+        bumper, a contact towards the strongest of them."""
+        reply = self.robot.last_reply
+        assert reply is not None
+        assert isinstance(self.monitor, LightMonitor)
+        image, motion = self.monitor.image(np.array(reply.light)), MotionKind(report.motion)
+        contact = (np.arange(len(image)) == image.argmax()) & (report.moment == StepEnd.ABORT)
+        plain = observation(report.odometry, image[None, :, None], motion=motion, whiskers=len(image))
+        return plain._replace(contact=contact, point=self.monitor.edge * contact[:, None])
+
+    def strain_series(self, state: CreateState, rows: int) -> np.ndarray:
+        """The samples [T, W, 2] of the first rows of a slow drive; T is 0 for other motions, without
+        whiskers, or if too many were lost."""
+        del state, rows
+        return np.zeros((0, len(self.alive), 2))
+
     def __exit__(self, *_: object) -> None:
         self.robot.close()
+
+
+class WhiskeredRig(HeadRig, CreateRig):
+    """A Create and its whiskers; `head` is the link to these."""
+
+    monitor: StrainMonitor
+
+    def __init__(self, config: LiveConfig, stopped: Callable[[], bool]) -> None:
+        CreateRig.__init__(self, config, stopped)
+        plan = self.create.plan
+        fan = fixed_whiskers(plan.whiskers)
+        self.alive = fan.alive.copy()
+        reader = HeadReader(lambda: open_bridge(config.head.address), len(fan.base), config.head)
+        HeadRig.__init__(self, config, reader, stopped)
+        rate, period = plan.whiskers.rate, plan.behaviour.period
+        self.monitor = StrainMonitor(rate, period, self.create.strain_per_radian, len(fan.base))
+        self._connections = 0  # of the whiskers, seen so far
+
+    @property
+    def fault(self) -> Fault | None:
+        return self.stream.fault or super().fault
+
+    @property
+    def connection(self) -> int | None:
+        return self.stream.restarts if self.stream.streaming else None
+
+    def poll(self) -> None:
+        """Reads the samples of the whiskers and the state of the robot; see `HeadRig`."""
+        for frames, arrival in self.stream.take():
+            if self.stream.restarts != self._connections:
+                self._connections = self.stream.restarts
+                self.monitor.restart()
+            if self.recorder is not None:
+                self.recorder.add_frames(frames, arrival - self.epoch)
+            self.monitor.add(frames)
+        CreateRig.poll(self)
+
+    def reading(self, report: Report) -> Report:
+        return report
+
+    def strain_series(self, state: CreateState, rows: int) -> np.ndarray:
+        nothing = super().strain_series(state, rows)
+        if state is not CreateState.FWD2:
+            return nothing
+        frames = self.head.ring.between(self.monitor.first, self.monitor.last_sample(rows))
+        strain = self.monitor.series(frames, rows, self.config.gap)
+        if not len(strain):
+            self.record_event("dropped", "the strain of a slow drive: samples are missing")
+            return nothing
+        return _known(self, strain)
+
+    def __exit__(self, *_: object) -> None:
+        super().__exit__()
         self.head.close()
+
+
+def open_create(config: LiveConfig, stopped: Callable[[], bool]) -> CreateRig:
+    """The rig of a session on a Create, by what it feels with."""
+    assert config.create is not None
+    return (CreateRig if config.create.touch == "light" else WhiskeredRig)(config, stopped)
+
+
+FREE_SDS = 8.0
+"""Standard deviations of the signal in free air above its mean up to which it says nothing."""
+
+
+class LightMonitor:
+    """The light bumpers as six range touches.
+
+    Their signals have no unit, and how they fall with the distance depends on the wall. So the image has the
+    logarithm of each, from what it is at most in free air (0), learned at rest, to the largest signal (1).
+
+    Attributes:
+        free: [6] signals up to which nothing is near. edge: [6, 2] of the robot before each sensor, m.
+    """
+
+    def __init__(self, behaviour: BehaviourConfig) -> None:
+        self._period, self._began = behaviour.period, time.monotonic()
+        self.free = np.ones(len(LIGHTS))
+        angle = np.radians(LIGHTS)
+        self.edge = behaviour.body * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def __str__(self) -> str:
+        return f"in free air up to {', '.join(f'{level:.0f}' for level in self.free)}, of {MOST_LIGHT}"
+
+    def begin(self) -> None:
+        """Starts a motion now."""
+        self._began = time.monotonic()
+
+    def rows(self, most: int) -> np.ndarray:
+        """Zeros [T, 6, 2] for the periods of the motion, at most so many: light ends no motion."""
+        passed = int((time.monotonic() - self._began) / self._period)
+        return np.zeros((min(passed, most), len(LIGHTS), 2))
+
+    def learn(self, signals: np.ndarray) -> None:
+        """Learns what signals are in free air from those [N, 6] at rest there."""
+        self.free = np.maximum(signals.mean(axis=0) + FREE_SDS * signals.std(axis=0), 1.0)
+
+    def image(self, signals: np.ndarray) -> np.ndarray:
+        """Pixels [6] in 0..1 of signals [6]; the nearer the higher."""
+        log = np.log(np.maximum(signals, self.free) / self.free)
+        return log / np.log(MOST_LIGHT / self.free)
 
 
 MAX_ROWS = 2**16
@@ -272,12 +405,12 @@ def run_create_loop(
                 time=np.arange(len(strain)) / plan.whiskers.rate,
                 strain=strain,
             )
-            sample = Sample(stamp, report, None)
+            sample = Sample(stamp, rig.reading(report), None)
             if rig.recorder is not None:
                 rig.recorder.add(sample)
             mapper.offer(sample)
             tell(stamp, doing.state, moment)
-            if not sampled:
+            if not sampled and isinstance(rig, HeadRig):
                 rig.await_samples("the whiskers send")  # the robot rests
             doing = next_state(plan.behaviour, doing, moment, odometry.dtheta, random, LEAST_TURN)
             touching, number = contact, number + 1
@@ -302,7 +435,7 @@ def _execute(
     last = state_machine.planned_rows(behaviour, command) - 1
     if rig.bumped:
         rig.robot.release()
-    life = rig.stream.restarts
+    life = rig.connection
     monitor.begin()
     bumped: list[bool] = []
     driven = _drive(rig, command)
@@ -316,7 +449,7 @@ def _execute(
         if now - before_poll > rig.create.patience:
             detail = f"the session stood still for {now - before_poll:.2f} s"
             raise session_fault(SessionOutcome.HOST_LATE, detail)
-        if not rig.stream.streaming or rig.stream.restarts != life:
+        if rig.connection is None or rig.connection != life:
             rig.robot.stop()
             whiskers = len(rig.alive)
             nothing = np.zeros(whiskers, bool), np.zeros((0, whiskers, 2))
@@ -333,7 +466,7 @@ def _execute(
     else:
         rig.robot.stop()
     contact = np.abs(_known(rig, rows)[row, :, 0]) > behaviour.contact
-    return moment, contact, _strain_series(rig, doing.state, row + 1), True
+    return moment, contact, rig.strain_series(doing.state, row + 1), True
 
 
 def _drive(rig: CreateRig, command: state_machine.WheelCommand) -> float:
@@ -349,20 +482,6 @@ def _drive(rig: CreateRig, command: state_machine.WheelCommand) -> float:
 def _known(rig: CreateRig, rows: np.ndarray) -> np.ndarray:
     """Rows with zeros for whiskers without a signal."""
     return np.where(rig.alive[:, None], rows, 0.0)
-
-
-def _strain_series(rig: CreateRig, state: CreateState, rows: int) -> np.ndarray:
-    """The samples [T, W, 2] of the slow drive; none for other motions, or if too many were lost."""
-    monitor = rig.monitor
-    nothing = np.zeros((0, len(rig.alive), 2))
-    if state is not CreateState.FWD2:
-        return nothing
-    frames = rig.head.ring.between(monitor.first, monitor.last_sample(rows))
-    strain = monitor.series(frames, rows, rig.config.gap)
-    if not len(strain):
-        rig.record_event("dropped", "the strain of a slow drive: samples are missing")
-        return nothing
-    return _known(rig, strain)
 
 
 def _wait_for_mapper(rig: CreateRig, mapper: AsyncMapper) -> None:

@@ -83,8 +83,10 @@ ARM_ONLY = ("arm", "plan", "waypoints", "whisks", "odometry", "noise", "lift", "
 
 
 class CreateLiveConfig(CreateConfig):
-    """A Create on a serial port with fixed whiskers; `live.head` is the link to the whiskers."""
+    """A Create on a serial port with fixed whiskers, to which `live.head` is the link, or a bare Create 2."""
 
+    touch: Literal["whiskers", "light"] = "whiskers"
+    """What it feels with: built-on whiskers, or the light bumpers and the bumper of a Create 2."""
     plan: CreateSimulationConfig = CreateSimulationConfig()
     """Behaviour, whiskers and duration (`minutes` or `reports`), as in a simulated session. The arena bounds
     the map; the emulator moves in it, with the errors in `wheels`."""
@@ -94,6 +96,12 @@ class CreateLiveConfig(CreateConfig):
     """Time for which the bumper may stay pressed, s; the robot backs off at once."""
     budget: PositiveFloat = 2.0
     """Lag of the mapper above which the robot waits for it, s."""
+
+    @model_validator(mode="after")
+    def _has_light(self) -> CreateLiveConfig:
+        if self.touch == "light" and self.model != "create2":
+            raise ValueError(f"touch: light: {self.model} has no light bumpers; `model: create2` has")
+        return self
 
 
 class LivePlanConfig(SimulationConfig):

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from robot.drivers.create.driver_config import CommandRefused
-from robot.drivers.create.protocol import MODELS, Bumps
+from robot.drivers.create.protocol import MODELS, MOST_LIGHT, Bumps
 from robot.drivers.create.serial_link import open_port
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.safety import check_controller
 from robot.live.arm_route import check_targets, plan_path
-from robot.live.create_rig import CreateRig
+from robot.live.create_rig import CreateRig, LightMonitor, WhiskeredRig, open_create
 from robot.live.live_config import LiveConfig
 from robot.live.live_rig import ArmRig, Rig
 from robot.live.polling import HeadRig
@@ -32,6 +32,8 @@ LISTEN_TIME = 1.5
 """Time for which the streams are observed, s."""
 MIN_RATE_SHARE = 0.9
 """Required share of a stream's nominal rate."""
+READINGS = 30
+"""Readings of the light bumpers from which free air is learned."""
 
 
 def check_session(
@@ -59,7 +61,7 @@ def check_session(
         yield from told
         return
     if config.create is not None:
-        with CreateRig(config, lambda: False) as robot:
+        with open_create(config, lambda: False) as robot:
             yield from find_devices(robot)
             yield from start_and_check(robot)
         return
@@ -118,13 +120,13 @@ def find_devices(rig: ArmRig | CreateRig) -> Iterator[str]:
         assert identity is not None
         sampled = f"{identity.whiskers} whiskers at {identity.rate:g} Hz"
         yield f"head: {identity.name} {identity.version}, {sampled}"
-    if isinstance(rig, CreateRig):
+    if isinstance(rig, WhiskeredRig):
         assert identity is not None
         wanted = rig.create.plan.whiskers.rate
         if abs(identity.rate - wanted) > 1e-6 * wanted:
             found, key = f"{identity.rate:g} samples per second", "live.create.plan.whiskers.rate"
             raise InputError("head", found, f"{wanted:g}, as in `{key}`", f"--set {key}={identity.rate:g}")
-    else:
+    elif not isinstance(rig, CreateRig):
         version = ".".join(map(str, check_controller(rig.config.arm).version))
         yield f"arm: {rig.config.arm.host}, PolyScope {version}, ready to start"
 
@@ -147,16 +149,18 @@ def start_and_check(rig: ArmRig | CreateRig) -> Iterator[str]:
             raise InputError("live.create", found, "a free bumper", cure)
         yield f"Create: {rig.create.port}, safe mode, at rest, guarded by a watchdog process"
         rig.monitor.begin()
+        if isinstance(rig.monitor, LightMonitor):
+            yield _learn_light(rig, rig.monitor)
     else:
         rig.arm.start()
         yield f"arm: {rig.config.arm.host}, admitted, states at {rig.config.arm.hz} Hz"
     if not isinstance(rig, HeadRig):
         return
     clocks = _check_stream(rig)
-    if isinstance(rig, CreateRig):
+    if isinstance(rig, WhiskeredRig):
         yield _check_whiskers(rig)
         yield clocks
-    else:
+    elif isinstance(rig, ArmRig):
         age = float(np.median(rig.state_ages[-100:]))
         yield f"{clocks}, newest state {age * 1e3:.0f} ms old"
 
@@ -185,7 +189,22 @@ def _check_stream(rig: HeadRig) -> str:
     return f"clocks: head {measured * 1e3:.1f} ms"
 
 
-def _check_whiskers(rig: CreateRig) -> str:
+def _learn_light(rig: CreateRig, monitor: LightMonitor) -> str:
+    """Learns the signals of the light bumpers in free air, in which the robot must stand."""
+    signals = list[tuple[int, ...]]()
+    for _ in range(READINGS):
+        rig.robot.refresh()
+        rig.poll()
+        signals += [reply.light for reply in [rig.robot.last_reply] if reply is not None]
+    monitor.learn(np.array(signals, float))
+    if (monitor.free**2 > MOST_LIGHT).any():  # half of the span of its image, a logarithm
+        found = f"something near, or dirt: {monitor}"
+        cure = "turn the robot to where nothing is near its front and sides; clean the windows"
+        raise InputError("live.create.touch", found, "free light bumpers", cure)
+    return f"light bumpers: {monitor}"
+
+
+def _check_whiskers(rig: WhiskeredRig) -> str:
     """Measures the strain at rest and finds whiskers without a signal."""
     newest = rig.head.ring.newest
     assert newest is not None

@@ -37,8 +37,9 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
         config = _fill(config, {"templates": {"source": "labels"}})
     if info.signed_views:
         config = _fill(config, {"recall": {"images": "signed"}})
-    # Touch without whiskers around the robot: what it measures has no layout that is known here.
-    other_touch = config.touch.frontend is not None and not source.whiskers
+    # Touch without whiskers all around the robot: what it measures has no layout that is known here.
+    registered = config.touch.frontend is not None and not source.whiskers
+    other_touch = registered or info.planar_whiskers is not None
     if other_touch:
         config = _fill(config, {"recall": {"sector_fov": "none"}})
     names = _choose_presets(config, source, other_touch) if config.presets is None else config.presets

@@ -38,6 +38,8 @@ MAX_DELAY = 0.1
 """Motion time that a reply may report beyond the elapsed time, s, after a delay in a buffer."""
 MOST_LIGHT = 4095
 """Largest signal of a light bumper."""
+LIGHTS = (65.0, 38.0, 13.0, -13.0, -38.0, -65.0)
+"""Directions of the light bumpers, from the left to the right, degrees counter-clockwise from ahead."""
 NUDGE = 5
 """Largest reported motion of a robot at rest, mm or degrees."""
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robot.drivers.create.protocol import COUNT, MOST_LIGHT, TOP_SPEED, Bumps, Mode
+from robot.drivers.create.protocol import COUNT, LIGHTS, MOST_LIGHT, TOP_SPEED, Bumps, Mode
 from robot.emulators.create.emulator_config import CreateEmulatorConfig
 from robot.simulation.create.wheel_odometry import simulate_wheel_odometry
 from robot.world.arena import Arena, wall_segments
@@ -15,10 +15,10 @@ from robot.world.walls import segment_distance
 from tactile.base.random_streams import stream
 
 DATA = {128: 0, 131: 0, 132: 0, 145: 4}  # bytes after an opcode; a query's first byte gives its length
-LIGHTS = tuple(math.radians(angle) for angle in (65, 38, 13, -13, -38, -65))
-"""Directions of the light bumpers, from the left to the right."""
 LIGHT_REACH = 0.03
 """Distance of a wall over which the signal of a light bumper falls to a third, m."""
+LIGHT_NOISE = 2.0
+"""Standard deviation of the noise of its signal."""
 PIECE = 0.01
 """Longest arc between two checks for walls, s."""
 MOVES = 4096
@@ -70,7 +70,7 @@ class EmulatedCreate:
             random, moves = stream(config.seed, "wheels"), np.ones((MOVES, 4))
             self._scales = simulate_wheel_odometry(config.world.wheels, moves, np.arange(MOVES) % 2, random)
             self._scales = self._scales[:, [0, 2]]
-        self._moves = 0
+        self._moves, self._light_noise = 0, stream(config.seed, "light")
         self._measured = [0.0, 0.0]  # mm and degrees by the wheels' encoders
         self._reported = [0.0, 0.0]  # sums of all replies, and of lost remainders: mm and degrees
         self._begun = b""  # an incomplete command
@@ -178,7 +178,7 @@ class EmulatedCreate:
             firmware = self.config.firmware
             return ((firmware.counts + math.floor(way / COUNT)) % firmware.wrap).to_bytes(2, "big")
         if 46 <= number <= 51:
-            return self._light(LIGHTS[number - 46]).to_bytes(2, "big")
+            return self._light(math.radians(LIGHTS[number - 46])).to_bytes(2, "big")
         return bytes([{7: int(self.bumps), 35: int(self.mode)}.get(number, 0)])
 
     def _light(self, angle: float) -> int:
@@ -189,7 +189,8 @@ class EmulatedCreate:
         direction = self.base.heading + angle
         edge = self.config.world.body * np.array([math.cos(direction), math.sin(direction)])
         room = float(segment_distance(self.walls, self.pose[None, :2] + edge).min())
-        return round(MOST_LIGHT * math.exp(-room / LIGHT_REACH))
+        signal = MOST_LIGHT * math.exp(-room / LIGHT_REACH) + self._light_noise.normal(0.0, LIGHT_NOISE)
+        return min(max(round(signal), 0), MOST_LIGHT)
 
     def _set_wheels(self, right: int, left: int) -> None:
         if (right, left) != (self.right, self.left):

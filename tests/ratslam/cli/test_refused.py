@@ -253,6 +253,7 @@ REFUSED = {
     "check source file --samples 0": "--samples positive",
     "emulate create live_maze": "live: that of an arm `live_create`",
     "emulate head live_create": "live: that of a Create `live_maze`",
+    "emulate create live_create --set live.create.touch=light": "touch: light create1 `model: create2`",
     "emulate head live_poke": "live.arm.touch: force head ur10",
     "localise empty SQUARE": "map.npz: no such file",
     "runn": "'runn'",

@@ -184,6 +184,24 @@ def test_a_session_is_repeated_to_the_bit(robot: CreateBench, tmp_path: Path, mo
     assert np.allclose([sample.time for sample in recording], np.cumsum([step.dt for step in odometry]))
 
 
+def test_light_bumpers_are_touches_that_are_recorded_and_repeated_to_the_bit(robot, tmp_path):
+    robot.ready("create2")
+    plan = {"arena": PLAN["arena"], "seed": 7, "reports": 12, "behaviour": {"fast": 0.15}}
+    live = robot.live(**SLACK, plan=plan, model="create2", touch="light")
+    with robot.session(live, grid={"particles": 20}) as session:
+        recording = robot.ended(session, "complete")
+    assert session.report()["standing"]
+    run(load_config(session.directory / "config.yaml"), tmp_path / "again")
+    for name in SAME:
+        assert (session.directory / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+    readings = [sample.reading for sample in recording]
+    touching = next(reading for reading in readings if reading.contact.any())
+    assert touching.view[0, touching.contact, 0] == touching.view.max() > 0.8
+    assert np.linalg.norm(touching.point[touching.contact]) == pytest.approx(0.17)  # the robot's radius
+    assert readings[0].view.max() < 0.4
+    assert [event.name for event in recording.events] == ["light"]
+
+
 def test_whiskers_that_are_unplugged_are_awaited(robot: CreateBench) -> None:
     """The robot stands meanwhile; the motion so far is recorded without a touch."""
     with robot.rolling() as session:
