@@ -32,8 +32,6 @@ LISTEN_TIME = 1.5
 """Time for which the streams are observed, s."""
 MIN_RATE_SHARE = 0.9
 """Required share of a stream's nominal rate."""
-READINGS = 30
-"""Readings of the light bumpers from which free air is learned."""
 
 
 def check_session(
@@ -192,7 +190,7 @@ def _check_stream(rig: HeadRig) -> str:
 def _learn_light(rig: CreateRig, monitor: LightMonitor) -> str:
     """Learns the signals of the light bumpers in free air, in which the robot must stand."""
     signals = list[tuple[int, ...]]()
-    for _ in range(READINGS):
+    for _ in range(round(LISTEN_TIME * rig.create.rate)):
         rig.robot.refresh()
         rig.poll()
         signals += [reply.light for reply in [rig.robot.last_reply] if reply is not None]
