@@ -94,7 +94,8 @@ def read_run(path: Path) -> RunArrays:
     if steps == 0:
         raise InputError(str(path), "a run without steps", "a run directory with results")
     time = online_time[:steps]
-    truth_time, truth = _tum(path / "truth.tum")
+    there = (path / "truth.tum").exists()
+    truth_time, truth = _tum(path / "truth.tum") if there else (np.zeros(0), np.zeros((0, 3)))
     known, row = np.isin(time, truth_time), np.searchsorted(truth_time, time)
     true = np.full((steps, 3), np.nan)
     true[known] = truth[row[known]]

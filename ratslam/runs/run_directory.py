@@ -11,7 +11,7 @@ import fcntl
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -41,8 +41,8 @@ COLUMNS = (
 """Columns of steps.csv before those of the backend: time (s), experience, action, online pose in the map
 frame and its standard deviations (m, m, rad), flag, probability that the map is worse than odometry,
 outcome."""
-STREAMS = ("online.tum", "odometry.tum", "truth.tum", "steps.csv", "online_error.csv", "timing.csv")
-"""Files that grow by whole lines."""
+STREAMS = ("online.tum", "odometry.tum", "steps.csv", "online_error.csv", "timing.csv")
+"""Files that grow by whole lines from the start on; truth.tum does from the first known pose on."""
 
 
 WhiskerView = tuple[np.ndarray, np.ndarray]
@@ -69,7 +69,7 @@ class RunDirectory(AbstractContextManager["RunDirectory"]):
             path.mkdir(parents=True)
         if manifest:
             self.text("manifest.json", manifest)
-        self._streams = {name: (path / name).open("x", encoding="utf-8", newline="") for name in STREAMS}
+        self._streams = {name: self._begin(name) for name in STREAMS}
         with suppress(OSError):  # a file system without locks
             fcntl.flock(self._streams["steps.csv"], fcntl.LOCK_EX)
         heads = {"steps.csv": ",".join((*COLUMNS, *columns)), "online_error.csv": "t,error"}
@@ -82,12 +82,19 @@ class RunDirectory(AbstractContextManager["RunDirectory"]):
             with suppress(OSError):
                 file.close()
 
+    def _begin(self, name: str) -> TextIO:
+        return (self.path / name).open("x", encoding="utf-8", newline="")
+
     def append(self, lines: Mapping[str, Iterable[str]]) -> None:
-        """Appends whole lines to the text files and flushes them."""
+        """Appends whole lines to the text files and flushes them; a file begins with its first line."""
         for name, added in lines.items():
             with self._writing(name):
-                self._streams[name].write("".join(added))
-                self._streams[name].flush()
+                text = "".join(added)
+                if text and name not in self._streams:
+                    self._streams[name] = self._begin(name)
+                if name in self._streams:
+                    self._streams[name].write(text)
+                    self._streams[name].flush()
 
     def text(self, name: str, content: str) -> None:
         """Writes a text file atomically."""
