@@ -35,13 +35,11 @@ def prepare_create_session(
     """Checks that the method maps what a Create reports; returns the function that opens the devices.
 
     Raises:
-        InputError: the backend needs views, which whiskers of a Create do not make.
+        InputError: the backend needs views; touch of a Create has none, or they look too much alike.
     """
-    assert config.live is not None
-    assert config.live.create is not None
-    if config.backend in ("recall", "classic") and config.live.create.touch == "whiskers":
+    if config.backend in ("recall", "classic"):
         found = f"{config.backend}, which recognises views"
-        expected = "a method that maps contacts, such as `grid`: these whiskers make no views"
+        expected = "a method that maps contacts, such as `grid`: touch of a Create tells no place by its look"
         raise InputError("backend", found, expected, "--set backend=grid")
     return lambda stopped: CreateSession(config, directory, stopped)
 

@@ -157,12 +157,13 @@ class CreateRig(PolledRig):
 
     def reading(self, report: Report) -> Report | Observation:
         """What is passed on of a motion: here the image of the light bumpers at its end and, of a pressed
-        bumper, a contact towards the strongest of them."""
+        bumper, a contact towards the strongest of them, if any is above free air."""
         reply = self.robot.last_reply
         assert reply is not None
         assert isinstance(self.monitor, LightMonitor)
         image, motion = self.monitor.image(np.array(reply.light)), MotionKind(report.motion)
-        contact = (np.arange(len(image)) == image.argmax()) & (report.moment == StepEnd.ABORT)
+        bumped = report.moment == StepEnd.ABORT
+        contact = (np.arange(len(image)) == image.argmax()) & (image > 0) & bumped
         plain = observation(report.odometry, image[None, :, None], motion=motion, whiskers=len(image))
         return plain._replace(contact=contact, point=self.monitor.edge * contact[:, None])
 

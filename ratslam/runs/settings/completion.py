@@ -38,9 +38,8 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
     if info.signed_views:
         config = _fill(config, {"recall": {"images": "signed"}})
     # Touch without whiskers all around the robot: what it measures has no layout that is known here.
-    registered = config.touch.frontend is not None and not source.whiskers
-    other_touch = registered or info.planar_whiskers is not None
-    if other_touch:
+    other_touch = config.touch.frontend is not None and not source.whiskers
+    if other_touch or info.planar_whiskers is not None:
         config = _fill(config, {"recall": {"sector_fov": "none"}})
     names = _choose_presets(config, source, other_touch) if config.presets is None else config.presets
     for name in names:

@@ -11,21 +11,32 @@ import signal
 import time
 from contextlib import AbstractContextManager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from evaluation.artifacts.run_reader import read_manifest
+from evaluation.metrics.trajectory import ate
+from ratslam.live.create_session import CreateSession
+from ratslam.runs.build_session import build_session
 from ratslam.runs.run import run
-from ratslam.runs.settings.run_config import load_config
+from ratslam.runs.settings.completion import complete
+from ratslam.runs.settings.run_config import RunConfig, load_config
 from ratslam.service.recording_check import diagnose_recording
+from robot.drivers.create.driver_config import CreateConfig
+from robot.live.create_rig import run_create_loop
 from robot.live.live_config import LiveConfig
+from robot.live.live_emulator_config import create_emulator_config
 from robot.live.selftest import check_session
 from robot.recordings.mcap_reader import Recording
+from robot.world.arena import make_arena
 from tactile.base.errors import InputError
+from tactile.base.se2 import integrate
 from tactile.base.types import MotionKind, StepEnd
 from tactile.whisker_geometry import HeadConfig
+from tests.helpers.create_line import Line, SimulatedDriver
 from tests.helpers.live import until
 from tests.ratslam.live.bench import PLAN, SLACK, CreateBench
 from tests.ratslam.live.live_session import Session
@@ -200,6 +211,82 @@ def test_light_bumpers_are_touches_that_are_recorded_and_repeated_to_the_bit(rob
     assert np.linalg.norm(touching.point[touching.contact]) == pytest.approx(0.17)  # the robot's radius
     assert readings[0].view.max() < 0.4
     assert [event.name for event in recording.events] == ["light"]
+
+
+class SimulatedCreate(SimulatedDriver):
+    """The driver of an emulated Create 2 in simulated time; sleeps are shorter than its period."""
+
+    last_reply = property(lambda self: self.loop.last_reply)
+    doubt, due = "", 0.0
+
+    def sleep(self, seconds):
+        self.line.wait(seconds)
+        if self.line.now >= self.due:
+            self.loop.poll()
+            self.due = self.line.now + self.period
+
+    def release(self):
+        self.loop.release()
+        self.sleep(self.period)
+
+    def odometry(self):
+        return self.loop.take_odometry()
+
+    def gap(self):
+        return self.loop.gap()
+
+
+def explore_by_light(monkeypatch, part):
+    """The readings of a session in simulated time, and the true poses [T, 3]."""
+    rig = part.rig
+    world = create_emulator_config(rig.create, "127.0.0.1")
+    line = Line(world, make_arena(rig.create.plan.arena, world.seed))
+    rig.robot = SimulatedCreate(line, CreateConfig(model=rig.create.model))
+    clock = SimpleNamespace(monotonic=lambda: line.now, sleep=rig.robot.sleep)
+    monkeypatch.setattr("robot.live.create_rig.time", clock)
+    monkeypatch.setattr("robot.live.create_rig.TICK", rig.robot.period / 2)
+    free = np.random.default_rng(world.seed).normal(0.0, 2.0, (30, 6)).round()
+    rig.monitor.learn(np.maximum(free, 0.0))
+    rig.begin()
+    readings, poses = [], []
+
+    def offer(sample):
+        readings.append(sample.reading)
+        poses.append(line.robot.pose)
+
+    mapper = SimpleNamespace(behind=lambda: 0.0, alive=True, offer=offer)
+    run_create_loop(rig, mapper, lambda *_: None)
+    return readings, np.array(poses)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("noise", ["measured", "bias"])
+def test_what_a_map_by_light_bumpers_is_worth(monkeypatch, tmp_path, noise):
+    """ATE in m of odometry; of the map; of maps of its contacts straight ahead and at random times."""
+    errors, session = [], None
+    for seed in range(10, 20):
+        plan = {"arena": PLAN["arena"], "wheels": {"noise": noise}, "seed": seed}
+        create = {"port": "create.tty", "model": "create2", "touch": "light", "plan": plan}
+        given = {"live": {"create": create}, "backend": "grid", "grid": {"side": 4.0}}
+        part = CreateSession(RunConfig.model_validate(given), tmp_path, lambda: False)
+        readings, truth = explore_by_light(monkeypatch, part)
+        if session is None:
+            session = build_session(complete(part.job.config, part.job.source, 2.0), part.job.source)
+        random, ahead = np.random.default_rng(seed).permutation(len(readings)), np.arange(6) == 2
+        touches = [(reading.contact, reading.point) for reading in readings]
+        maps = touches, [(any(c) & ahead, 0.17 * np.outer(any(c) & ahead, (1, 0))) for c, _ in touches]
+        found = [ate(integrate(np.array([reading.odometry[:3] for reading in readings])), truth)]
+        for touched in (*maps, [touches[k] for k in random]):
+            session.restart(0)
+            both = zip(readings, touched, strict=True)
+            list(session.replay([each._replace(contact=c, point=p) for each, (c, p) in both]))
+            found.append(ate(session.map.trajectory(), truth))
+        errors.append(found)
+        print(noise, seed, *(f"{error:.3f}" for error in found), flush=True)
+    worse = (np.array(errors)[:, 1:] > np.array(errors)[:, :1]).sum(axis=0)
+    print(noise, "median", np.median(errors, axis=0).round(3), "worse than odometry", worse)
+    assert np.median(errors, axis=0)[1] < np.median(errors, axis=0)[[0, 3]].min()
 
 
 def test_whiskers_that_are_unplugged_are_awaited(robot: CreateBench) -> None:
