@@ -39,7 +39,7 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
         config = _fill(config, {"recall": {"images": "signed"}})
     # Touch without whiskers all around the robot: what it measures has no layout that is known here.
     other_touch = config.touch.frontend is not None and not source.whiskers
-    if other_touch or info.planar_whiskers is not None:
+    if other_touch or (info.planar_whiskers is not None and not info.raw_whiskers):
         config = _fill(config, {"recall": {"sector_fov": "none"}})
     names = _choose_presets(config, source, other_touch) if config.presets is None else config.presets
     for name in names:
