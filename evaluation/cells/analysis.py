@@ -20,7 +20,7 @@ import numpy as np
 from evaluation.cells import head_direction
 from evaluation.cells.fields import border_score, find_fields
 from evaluation.cells.grid_score import HEXAGONAL, SQUARE, autocorrelogram, score_lattices
-from evaluation.cells.information import information, information_rate, mean_rate, selectivity, sparsity
+from evaluation.cells.information import information, mean_rate, selectivity, sparsity
 from evaluation.cells.rate_map import (
     LEAST_SECONDS,
     coherence,
@@ -31,7 +31,7 @@ from evaluation.cells.rate_map import (
     tuning_curves,
     weigh_bins,
 )
-from evaluation.cells.recording import CellRecording
+from evaluation.cells.recording import BinnedSums, CellRecording
 from evaluation.cells.shuffling import ShuffledScores, path_bins, shuffled_scores
 from tactile.base.files import write_atomically
 
@@ -89,14 +89,11 @@ def analyse_cells(recording: CellRecording, gain: float | None = None) -> CellSc
             was visited.
     """
     (sums, cell), hz = recorded_sums(recording), gain or math.prod(recording.shape) or 1.0
-    rates, curves = rate_maps(sums) * hz, tuning_curves(sums) * hz
-    place, turn = (rates, sums.seconds), (curves, sums.heading_seconds)
-    fields, about_place, about_heading = find_fields(rates), information(*place), information(*turn)
+    parts = [_score_sums(part, hz) for part in sums.parts()]
     sheet = np.full((3, len(cell)), np.nan)
     if any(recording.shape):
         sheet = np.array(np.unravel_index(cell, recording.shape), float)
     heading, row, column = sheet
-    lattice = score_lattices(autocorrelogram(rates), LATTICES)
     speed = np.full(len(cell), np.nan)
     if len(recording.cell):
         at = path_bins(recording, "speed")
@@ -105,33 +102,44 @@ def analyse_cells(recording: CellRecording, gain: float | None = None) -> CellSc
             rows = at.flat[inside], at.seconds[inside], recording.activity[inside]
             seconds, total = sum_into(*rows, at.shape)
             speed = speed_score(total / np.where(seconds > 0, seconds, np.nan), seconds)
-    bin_area = float((sums.x_edges[1] - sums.x_edges[0]) * (sums.y_edges[1] - sums.y_edges[0]))
     return CellScores(
         cell=np.asarray(cell),
         sheet_x=column * recording.cell_size,
         sheet_y=row * recording.cell_size,
         sheet_heading=heading * 2 * np.pi / max(recording.shape[0], 1),
-        mean_rate=mean_rate(*place),
-        peak_rate=head_direction.peak_rate(*place),
-        information=about_place,
-        information_rate=information_rate(*place),
-        sparsity=sparsity(*place),
-        selectivity=selectivity(*place),
-        coherence=coherence(rate_maps(sums, 0.0), sums.seconds),
-        fields=fields.number,
-        field_area=fields.largest * bin_area,
-        border=border_score(*place),
-        grid=lattice[0],
-        square=lattice[1],
-        vector_length=head_direction.mean_vector_length(*turn),
-        direction=head_direction.preferred_direction(*turn),
-        heading_peak=head_direction.peak_rate(*turn),
-        rayleigh_z=head_direction.rayleigh_z(*turn),
-        rayleigh_p=head_direction.rayleigh_p(*turn),
-        heading_information=about_heading,
-        conjunctive=np.minimum(about_place, about_heading),
+        **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
         speed=speed,
     )
+
+
+def _score_sums(sums: BinnedSums, hz: float) -> dict[str, np.ndarray]:
+    """The scores [n] of sums, by name."""
+    rates, curves = rate_maps(sums) * hz, tuning_curves(sums) * hz
+    place, turn = (rates, sums.seconds), (curves, sums.heading_seconds)
+    fields, about_place, about_heading = find_fields(rates), information(*place), information(*turn)
+    mean, lattice = mean_rate(*place), score_lattices(autocorrelogram(rates), LATTICES)
+    bin_area = float((sums.x_edges[1] - sums.x_edges[0]) * (sums.y_edges[1] - sums.y_edges[0]))
+    return {
+        "mean_rate": mean,
+        "peak_rate": head_direction.peak_rate(*place),
+        "information": about_place,
+        "information_rate": about_place * mean,
+        "sparsity": sparsity(*place),
+        "selectivity": selectivity(*place),
+        "coherence": coherence(rate_maps(sums, 0.0), sums.seconds),
+        "fields": fields.number,
+        "field_area": fields.largest * bin_area,
+        "border": border_score(*place),
+        "grid": lattice[0],
+        "square": lattice[1],
+        "vector_length": head_direction.mean_vector_length(*turn),
+        "direction": head_direction.preferred_direction(*turn),
+        "heading_peak": head_direction.peak_rate(*turn),
+        "rayleigh_z": head_direction.rayleigh_z(*turn),
+        "rayleigh_p": head_direction.rayleigh_p(*turn),
+        "heading_information": about_heading,
+        "conjunctive": np.minimum(about_place, about_heading),
+    }
 
 
 def speed_score(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:

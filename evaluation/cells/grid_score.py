@@ -14,15 +14,19 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy import fft, sparse
+from scipy import fft
 from scipy.ndimage import maximum_filter
 
+from evaluation.cells.rate_map import known_bins
+from tactile.base.compiled import compiled
 from tactile.base.errors import InputError
 
 _OVERLAP = 0.8
 """Kept lags reach this share of the side of the map, as in opexebo."""
 _MAPS_AT_ONCE = 64
 """Maps of one batch: its arrays fit the cache."""
+_FLAT = 1e-12
+"""A variance below this share of the mean square is rounding: the bins are flat."""
 
 
 def autocorrelogram(rates: np.ndarray) -> np.ndarray:
@@ -50,47 +54,57 @@ def autocorrelogram(rates: np.ndarray) -> np.ndarray:
     if rates.ndim != 3 or 0 in rates.shape[1:]:
         raise InputError("rates", f"array of shape {list(rates.shape)}", "maps [n, H, W] with bins")
     # The largest kept lags.
-    reach = [(int(np.round(side + side * _OVERLAP)) - 1) // 2 for side in rates.shape[1:]]
-    maps = np.empty((len(rates), 2 * reach[0] + 1, 2 * reach[1] + 1))
+    down, right = ((int(np.round(side + side * _OVERLAP)) - 1) // 2 for side in rates.shape[1:])
+    maps = np.empty((len(rates), 2 * down + 1, 2 * right + 1))
     for start in range(0, len(rates), _MAPS_AT_ONCE):
         batch = slice(start, start + _MAPS_AT_ONCE)
-        visited = np.isfinite(rates[batch])
+        visited = known_bins(rates[batch])
         # Maps of mean 0 and mean square 1, 0 without visits.
         count = np.maximum(visited.sum(axis=(1, 2)), 1)[:, None, None]
         filled = np.where(visited, rates[batch], 0.0)
         values = np.where(visited, filled - filled.sum(axis=(1, 2), keepdims=True) / count, 0.0)
         scale = np.sqrt((values**2).sum(axis=(1, 2), keepdims=True) / count)
         flat = scale <= _FLAT * np.abs(filled).max(axis=(1, 2), keepdims=True)
-        maps[batch] = _correlate(values / np.where(flat, 1.0, scale), visited, reach)
+        maps[batch] = _correlate(values / np.where(flat, 1.0, scale), visited, (down, right))
         maps[batch][flat[:, 0, 0]] = np.nan
     return maps
 
 
-def _correlate(values: np.ndarray, visited: np.ndarray, reach: list[int]) -> np.ndarray:
+def _correlate(values: np.ndarray, visited: np.ndarray, reach: tuple[int, int]) -> np.ndarray:
     """Correlations [n, h, w] at the kept lags."""
-    height, width = values.shape[1:]
-    size = (fft.next_fast_len(height + reach[0], real=True), fft.next_fast_len(width + reach[1], real=True))
+    shape = [side + kept for side, kept in zip(values.shape[1:], reach, strict=True)]
+    size = fft.next_fast_len(shape[0]), fft.next_fast_len(shape[1], real=True)
+    of_mask, of_values, of_squares = (fft.rfft2(part, size) for part in (visited * 1.0, values, values**2))
+    pairs = (of_mask, of_mask), (of_mask, of_values), (of_mask, of_squares), (of_values, of_values)
+    common, *sums = (fft.irfft2(np.conj(left) * right, size) for left, right in pairs)
+    return _at_lags(np.round(common), *sums, values.shape[1:], reach)
 
-    def correlate(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        lags = fft.irfft2(np.conj(left) * right, size)
-        lags = np.concatenate([lags[:, size[0] - reach[0] :], lags[:, : reach[0] + 1]], axis=1)
-        return np.concatenate([lags[:, :, size[1] - reach[1] :], lags[:, :, : reach[1] + 1]], axis=2)
 
-    mask = (visited[:1] if (visited == visited[:1]).all() else visited).astype(float)
-    of_mask, of_values, of_squares = (fft.rfft2(part, size) for part in (mask, values, values**2))
-    common = np.round(correlate(of_mask, of_mask))
-    total = correlate(of_mask, of_values)
-    variance = common * correlate(of_mask, of_squares) - total**2
-    product = common * correlate(of_values, of_values) - total * total[:, ::-1, ::-1]
-    flat = variance <= _FLAT * common * height * width
-    deviation = np.sqrt(np.where(flat, np.inf, variance))
-    enough = common >= (height - reach[0]) * (width - reach[1])
-    return np.where(enough, product / deviation / deviation[:, ::-1, ::-1], np.nan)
+@compiled
+def _at_lags(
+    common: np.ndarray, totals: np.ndarray, squares: np.ndarray, products: np.ndarray,
+    shape: tuple[int, int], reach: tuple[int, int],
+) -> np.ndarray:  # fmt: skip
+    """Correlations [n, h, w] from the sums [n, ...] over the common bins, at negative lags from their ends;
+    of these bins the count [n or 1, ...]."""
+    (height, width), (down, right) = shape, reach
+    maps = np.full((len(totals), 2 * down + 1, 2 * right + 1), np.nan)
+    for k in range(len(totals)):
+        for y in range(down + 1):
+            for x in range(-right, right + 1):
+                count, one, other = common[k % len(common), y, x], totals[k, y, x], totals[k, -y, -x]
+                if count < (height - down) * (width - right):
+                    continue
+                first, second = count * squares[k, y, x] - one**2, count * squares[k, -y, -x] - other**2
+                correlation = (count * products[k, y, x] - one * other) / np.sqrt(first * second)
+                if min(first, second) <= _FLAT * count * height * width:
+                    correlation = 0.0
+                maps[k, down + y, right + x] = maps[k, down - y, right - x] = correlation
+    return maps
 
 
 _SMALLEST = 5
 """Bins of the smallest field."""
-_TOP = np.uint8(255)
 
 
 def centre_radii(autocorrelograms: np.ndarray) -> np.ndarray:
@@ -105,112 +119,111 @@ def centre_radii(autocorrelograms: np.ndarray) -> np.ndarray:
     Processing 2:176).
 
     Args:
-        autocorrelograms: [h, w, n] finite, odd sides; maps last, so that the floods run over contiguous maps.
+        autocorrelograms: [n, h, w] finite, odd sides.
     """
-    # Without peaks narrower than a cross of 5 bins: opening by reconstruction.
-    eroded = autocorrelograms.copy()
-    for thin, full in ((eroded, autocorrelograms), (eroded.swapaxes(0, 1), autocorrelograms.swapaxes(0, 1))):
-        np.minimum(thin[1:], full[:-1], out=thin[1:])
-        np.minimum(thin[:-1], full[1:], out=thin[:-1])
-    opened = _flood(eroded, autocorrelograms, diagonal=True)
-    height, width, _ = opened.shape
-    peak = opened[height // 2, width // 2]
-    thresholds, schedules = _schedules()
-    share = opened / np.where(peak > 0, peak, np.inf)
-    levels = np.searchsorted(thresholds, share, side="right").astype(np.uint8)
-    # The highest level at which each bin is connected by sides to the centre.
-    seed = np.zeros_like(levels)
-    seed[height // 2, width // 2] = levels[height // 2, width // 2]
-    areas = _areas(_flood(seed, levels), len(thresholds))
-    size = np.zeros(levels.shape[2])
-    waiting = np.ones(levels.shape[2], bool)
-    for growth, steps in schedules:
-        first, falling = (np.searchsorted(thresholds, each) for each in (growth, steps))
-        start = np.isfinite(areas[first]).all(axis=0) & waiting
-        if start.any():
-            size[start] = _grow(areas[:, start], first, falling)
-        waiting &= ~start
-    return np.where(size >= _SMALLEST, np.floor(np.sqrt(size / np.pi)), 0.0).astype(int)
+    framed = np.pad(autocorrelograms, ((0, 0), (1, 1), (1, 1)), constant_values=np.inf)
+    sizes = np.array([_central_bins(each, *_schedules()) for each in framed])
+    return np.where(sizes >= _SMALLEST, np.floor(np.sqrt(sizes / np.pi)), 0.0).astype(int)
 
 
 @lru_cache(maxsize=1)
-def _schedules() -> tuple[np.ndarray, list[tuple[tuple[float, float], np.ndarray]]]:
+def _schedules() -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     """All thresholds in use, rising, as shares of the peak, and the schedules in the order in which they are
-    tried: two thresholds, of whose areas the ratio is the ordinary growth, and the falling thresholds."""
+    tried, as indices of thresholds: two of whose areas the ratio is the ordinary growth, and the falling
+    ones."""
     growths = [(0.95, 0.95 - 0.02)] + [(high, high - 0.01) for high in np.linspace(0.96, 1.0, 4)]
     schedules = []
     for high, low in growths:
         first = high if high == 0.95 else low
         steps = np.round(np.linspace(first, 0.2, int((first - 0.2) / 0.02) + 1), 2)
-        schedules.append(((high, low), steps))
-    return np.unique(np.concatenate([np.r_[growth, steps] for growth, steps in schedules])), schedules
+        schedules.append(np.r_[high, low, steps])
+    thresholds = np.unique(np.concatenate(schedules))
+    return thresholds, tuple(np.searchsorted(thresholds, each) for each in schedules)
 
 
-def _grow(areas: np.ndarray, growth: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Bins [n] of the fields that grow from areas [K, n] along the rows of a schedule; 0 where the first step
-    fails."""
-    high, low = areas[growth]
-    last, field = low.copy(), np.zeros_like(low)
-    shrunk, same = np.zeros_like(low), np.zeros_like(low)
-    grows = np.ones(len(low), bool)
-    for area in areas[steps]:
-        change = area / last
-        shrunk = np.where(change < 1, shrunk + 1, 0)
-        same = np.where(change == 1, same + 1, 0)
-        grows &= (np.floor(change / (low / high)) <= 2) & (shrunk < 3) & (same < 10)
-        last, field = np.where(grows, area, last), np.where(grows, area, field)
+@compiled
+def _central_bins(image: np.ndarray, thresholds: np.ndarray, schedules: tuple[np.ndarray, ...]) -> float:
+    """Bins of the central field of a map [h, w] that a frame of infinite values is part of; 0 without one."""
+    height, width = image.shape
+    opened, levels, regions, walls = np.zeros((4, height, width))
+    # Without peaks narrower than a cross of 5 bins: opening by reconstruction.
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            across = min(image[y, x - 1], image[y, x], image[y, x + 1])
+            opened[y, x] = min(across, image[y - 1, x], image[y + 1, x])
+    _flood(opened, image, True)
+    peak = opened[height // 2, width // 2]
+    if peak <= 0:
+        return 0.0
+    # How many thresholds each bin reaches, and the highest level at which sides connect it to the centre.
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            while levels[y, x] < len(thresholds) and thresholds[int(levels[y, x])] <= opened[y, x] / peak:
+                levels[y, x] += 1
+    regions[height // 2, width // 2] = levels[height // 2, width // 2]
+    _flood(regions, levels, False)
+    # Minus the lowest wall on the way by sides to the border; it is above the bin in holes.
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            levels[y, x], walls[y, x] = -regions[y, x], -len(thresholds)
+    _flood(walls, levels, False)
+    # Bins of the region at each threshold, and of its holes.
+    areas, holes = np.zeros((2, len(thresholds) + 1))
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            areas[int(regions[y, x])] += 1
+            holes[int(regions[y, x])] += 1
+            holes[int(-walls[y, x])] -= 1
+    for level in range(1, len(areas)):
+        holes[level] += holes[level - 1]
+        areas[-level - 1] += areas[-level]
+    areas = areas[1:]
+    for steps in schedules:
+        high, low = areas[steps[0]], areas[steps[1]]
+        if high > 0 and low > 0 and holes[steps[0]] == 0 and holes[steps[1]] == 0:
+            return _grow(areas, holes, steps)
+    return 0.0
+
+
+@compiled
+def _grow(areas: np.ndarray, holes: np.ndarray, steps: np.ndarray) -> float:
+    """Bins of the field that grows along the steps of a schedule; 0 where the first of them fails."""
+    usual, area = areas[steps[1]] / areas[steps[0]], areas[steps[1]]
+    field, shrunk, same = 0.0, 0, 0
+    for step in steps[2:]:
+        change = areas[step] / area
+        shrunk = shrunk + 1 if change < 1 else 0
+        same = same + 1 if change == 1 else 0
+        if holes[step] > 0 or np.floor(change / usual) > 2 or shrunk == 3 or same == 10:
+            break
+        area = field = areas[step]
     return field
 
 
-def _areas(regions: np.ndarray, count: int) -> np.ndarray:
-    """Bins of the central region at each of `count` thresholds: [count, n]; NaN if empty or with a hole."""
-    maps = regions.shape[2]
-    slots = regions + (count + 1) * np.arange(maps)
-    bins = np.bincount(slots.ravel(), minlength=maps * (count + 1)).reshape(maps, count + 1).T
-    areas = bins[::-1].cumsum(axis=0)[-2::-1].astype(float)
-    # The lowest wall [h, w, n] on the way by sides from each bin to the border; above its level in holes.
-    depth = _TOP - regions
-    seed = depth.copy()
-    seed[1:-1, 1:-1] = 0
-    walls = _TOP - _flood(seed, depth)
-    row, column, index = np.nonzero(walls > regions)
-    change = np.zeros((count + 1, maps), int)
-    np.add.at(change, (regions[row, column, index], index), 1)
-    np.add.at(change, (walls[row, column, index], index), -1)
-    areas[(change.cumsum(axis=0)[:count] > 0) | (areas == 0)] = np.nan
-    return areas
+@compiled
+def _flood(levels: np.ndarray, ceiling: np.ndarray, diagonal: bool) -> None:
+    """Raises levels [h, w] within their frame to those of neighbours by sides, or `diagonal` ones as well, at
+    most to the ceiling, until nothing changes."""
+    raised = True
+    while raised:
+        raised = _sweep(levels, ceiling, diagonal)
+        raised |= _sweep(levels[::-1, ::-1], ceiling[::-1, ::-1], diagonal)
 
 
-def _flood(levels: np.ndarray, ceiling: np.ndarray, diagonal: bool = False) -> np.ndarray:
-    """Raises levels [h, w, n] to those of neighbours by sides, or `diagonal` ones as well, at most to the
-    ceiling, until nothing changes."""
-    done = np.empty_like(levels)
-    active = np.arange(levels.shape[2])
-    while len(active):
-        before = levels.copy()
-        for across, top in ((levels, ceiling), (levels.swapaxes(0, 1), ceiling.swapaxes(0, 1))):
-            _sweep(across, top, diagonal)
-            _sweep(across[::-1], top[::-1], diagonal)
-        changed = (levels != before).any(axis=(0, 1))
-        done[..., active[~changed]] = levels[..., ~changed]
-        active, levels, ceiling = active[changed], levels[..., changed], ceiling[..., changed]
-    return done
-
-
-def _sweep(levels: np.ndarray, ceiling: np.ndarray, diagonal: bool) -> None:
-    """Raises each row to the row before it, in place."""
-    for before, row, top in zip(levels, levels[1:], ceiling[1:], strict=False):
-        np.maximum(row, before, out=row)
-        if diagonal:
-            np.maximum(row[1:], before[:-1], out=row[1:])
-            np.maximum(row[:-1], before[1:], out=row[:-1])
-        np.minimum(row, top, out=row)
-
-
-_SCORED_AT_ONCE = 128
-"""Maps of one batch: its arrays fit the cache."""
-_FLAT = 1e-12
-"""A variance below this share of the mean square is rounding: the annulus is flat."""
+@compiled
+def _sweep(levels: np.ndarray, ceiling: np.ndarray, diagonal: bool) -> bool:
+    """Raises each bin to those before it; whether any was raised."""
+    raised = False
+    for y in range(1, levels.shape[0] - 1):
+        for x in range(1, levels.shape[1] - 1):
+            level = max(levels[y - 1, x], levels[y, x - 1])
+            if diagonal:
+                level = max(level, levels[y - 1, x - 1], levels[y - 1, x + 1])
+            level = min(level, ceiling[y, x])
+            if level > levels[y, x]:
+                levels[y, x] = level
+                raised = True
+    return raised
 
 
 class Lattice(NamedTuple):
@@ -232,17 +245,16 @@ class _Annuli(NamedTuple):
     """Bins of half an autocorrelogram in the order of their radius; it is symmetric, so half suffices.
 
     Attributes:
-        half: [P] flat indices. rotation: [A * P, h * w] bilinear rotation by each angle.
-        starts: [S] where the distinct sums start. below, within: [R + 1] how many of these sums have a radius
-            < r, <= r, for r = 0 .. R bins. bins: [S + 1] in the first sums.
+        half: [P] flat indices. corners: [P, A] those of the first of the four bins round each of them after a
+            rotation by each angle. weights: [P, A, 4] of the four. below, within: [R + 1] how many of the P
+            have a radius < r, <= r, for r = 0 .. R bins.
     """
 
     half: np.ndarray
-    rotation: sparse.csr_array
-    starts: np.ndarray
+    corners: np.ndarray
+    weights: np.ndarray
     below: np.ndarray
     within: np.ndarray
-    bins: np.ndarray
 
 
 def lattice_scores(autocorrelograms: np.ndarray, lattice: Lattice = HEXAGONAL) -> np.ndarray:
@@ -266,56 +278,53 @@ def score_lattices(autocorrelograms: np.ndarray, lattices: Sequence[Lattice]) ->
     if maps.ndim != 3 or any(side % 2 == 0 for side in maps.shape[1:]):
         found = f"array of shape {list(maps.shape)}"
         raise InputError("autocorrelograms", found, "maps [n, h, w] with odd sides")
-    batches = [maps[i : i + _SCORED_AT_ONCE] for i in range(0, len(maps), _SCORED_AT_ONCE)]
-    scored = [_score_batch(batch, lattices) for batch in batches]
-    return np.concatenate(scored or [np.empty((len(lattices), 0))], axis=1)
-
-
-def _score_batch(maps: np.ndarray, lattices: Sequence[Lattice]) -> np.ndarray:
-    """Scores [k, n] of a batch [n, h, w] that fits the cache."""
-    scores = np.full((len(lattices), len(maps)), np.nan)
     height, width = maps.shape[1:]
     (valid,) = np.nonzero(maps[:, height // 2, width // 2] > 0)
-    stacked = np.ascontiguousarray(np.nan_to_num(maps[valid]).transpose(1, 2, 0))
-    stacked /= stacked.max(axis=(0, 1)) if valid.size else 1.0
-    inner = centre_radii(stacked)
-    outer = min(height, width) // 2
-    found = (inner > 0) & (inner < outer)
-    if not found.any():
-        return scores
-    flat = stacked[..., found].reshape(height * width, -1)
+    maps = maps[valid]
+    maps[np.isnan(maps)] = 0.0
+    inner = centre_radii(maps)
+    found = (inner > 0) & (inner < min(height, width) // 2)
+    scores = np.full((len(lattices), len(autocorrelograms)), np.nan)
     for k, lattice in enumerate(lattices):
-        scores[k, valid[found]] = _best(_curves(flat, inner[found], lattice, height, width), inner[found])
+        curves = _curves(maps[found], inner[found], _annuli(lattice, height, width))
+        onto = len(lattice.onto)
+        curves = curves[:onto].min(axis=0) - curves[onto:].max(axis=0)
+        scores[k, valid[found]] = _best(curves, inner[found])
     return scores
 
 
-def _curves(maps: np.ndarray, inner: np.ndarray, lattice: Lattice, height: int, width: int) -> np.ndarray:
-    """Scores [R + 1, n] of the annuli from `inner` [n] to each outer radius 0 .. R, bins; maps [h * w, n].
-
-    All rotated maps are one product with a sparse matrix, and sums over annuli are differences of cumulative
-    sums over bins in the order of their radius.
-    """
-    annuli = _annuli(lattice, height, width)
-    base = maps[annuli.half]
-    turned = (annuli.rotation @ maps).reshape(-1, *base.shape)
-
-    def add(values: np.ndarray) -> np.ndarray:
-        sums = np.add.reduceat(values, annuli.starts, axis=-2).cumsum(axis=-2)
-        sums = np.concatenate([np.zeros_like(sums[..., :1, :]), sums], axis=-2)
-        index = annuli.within[inner].reshape((1,) * (sums.ndim - 1) + (-1,))
-        return sums[..., annuli.below, :] - np.take_along_axis(sums, index, axis=-2)
-
-    count = annuli.bins[annuli.below][:, None] - annuli.bins[annuli.within[inner]]
-    count = np.maximum(count, 1)
-    mean, turned_mean = add(base) / count, add(turned) / count
-    square, turned_square = add(base * base) / count, add(turned * turned) / count
-    covariance = add(turned * base) / count - mean * turned_mean
-    variance, turned_variance = square - mean**2, turned_square - turned_mean**2
-    flat = (variance <= _FLAT * square) | (turned_variance <= _FLAT * turned_square)
-    product = np.where(flat, np.nan, variance * turned_variance)
-    correlation = np.clip(covariance / np.sqrt(product), -1.0, 1.0)
-    onto = len(lattice.onto)
-    return correlation[:onto].min(axis=0) - correlation[onto:].max(axis=0)
+@compiled
+def _curves(maps: np.ndarray, inner: np.ndarray, annuli: _Annuli) -> np.ndarray:
+    """Correlations [A, R + 1, n] of the annuli from `inner` [n] to each outer radius 0 .. R, bins, with
+    themselves after rotations; NaN where they are flat. maps: [n, h, w]."""
+    (count, _, width), angles, radii = maps.shape, annuli.corners.shape[1], len(annuli.below)
+    curves = np.full((angles, radii, count), np.nan)
+    for k in range(count):
+        image, last = maps[k].ravel(), annuli.within[inner[k]]
+        first, total, square, turned = last, 0.0, 0.0, np.zeros((angles, 3))
+        for radius in range(inner[k] + 1, radii):
+            for p in range(last, annuli.below[radius]):
+                value = image[annuli.half[p]]
+                total += value
+                square += value * value
+                for angle in range(angles):
+                    at, (a, b, c, d) = annuli.corners[p, angle], annuli.weights[p, angle]
+                    other = (
+                        a * image[at] + b * image[at + 1] + c * image[at + width] + d * image[at + width + 1]
+                    )
+                    turned[angle, 0] += other
+                    turned[angle, 1] += other * other
+                    turned[angle, 2] += other * value
+            last = annuli.below[radius]
+            bins = max(last - first, 1)
+            variance = square / bins - (total / bins) ** 2
+            for angle in range(angles):
+                mean, power, product = turned[angle] / bins
+                other = power - mean**2
+                if variance * bins > _FLAT * square and other > _FLAT * power:
+                    covariance = product - mean * total / bins
+                    curves[angle, radius, k] = covariance / np.sqrt(variance * other)
+    return np.clip(curves, -1.0, 1.0)
 
 
 def _best(curves: np.ndarray, inner: np.ndarray) -> np.ndarray:
@@ -342,7 +351,10 @@ def _best(curves: np.ndarray, inner: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _annuli(lattice: Lattice, height: int, width: int) -> _Annuli:
-    """The annuli and rotations of autocorrelograms of odd height and width."""
+    """The annuli and bilinear rotations of autocorrelograms of odd height and width.
+
+    The sense of rotation is that of `skimage.transform.rotate`.
+    """
     outer = min(height, width) // 2
     y, x = np.mgrid[:height, :width]
     y, x = (y - height // 2).ravel(), (x - width // 2).ravel()
@@ -352,31 +364,15 @@ def _annuli(lattice: Lattice, height: int, width: int) -> _Annuli:
     whole = np.arange(outer + 1)
     below = np.searchsorted(radius[half], whole, side="left")
     within = np.searchsorted(radius[half], whole, side="right")
-    count = np.unique(np.concatenate([below, within, [0]]))
     angles = np.deg2rad(lattice.onto + lattice.between)
-    rotation = sparse.vstack([_rotation(angle, y[half], x[half], height, width) for angle in angles])
-    below, within = np.searchsorted(count, below), np.searchsorted(count, within)
-    return _Annuli(half, sparse.csr_array(rotation), count[:-1], below, within, count)
-
-
-def _rotation(angle: float, y: np.ndarray, x: np.ndarray, height: int, width: int) -> sparse.csr_array:
-    """Bilinear rotation about the centre by an angle, rad: [P, h * w] for the bins at offsets y, x [P].
-
-    The sense of rotation is that of `skimage.transform.rotate`.
-    """
-    column = np.cos(angle) * x - np.sin(angle) * y + width // 2
-    row = np.sin(angle) * x + np.cos(angle) * y + height // 2
+    y, x = y[half, None], x[half, None]
+    column = np.cos(angles) * x - np.sin(angles) * y + width // 2
+    row = np.sin(angles) * x + np.cos(angles) * y + height // 2
     low_row = np.clip(np.floor(row).astype(int), 0, height - 2)
     low_column = np.clip(np.floor(column).astype(int), 0, width - 2)
-    part_row, part_column = row - low_row, column - low_column
-    rows, columns, weights = [], [], []
-    for up in (0, 1):
-        for right in (0, 1):
-            rows.append(np.arange(len(x)))
-            columns.append((low_row + up) * width + low_column + right)
-            weights.append(abs(1 - up - part_row) * abs(1 - right - part_column))
-    entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
-    return sparse.csr_array(entries, shape=(len(x), height * width))
+    up, right = row - low_row, column - low_column
+    weights = (1 - up) * (1 - right), (1 - up) * right, up * (1 - right), up * right
+    return _Annuli(half, low_row * width + low_column, np.stack(weights, axis=2), below, within)
 
 
 _CLOSE = np.deg2rad(15.0)
@@ -409,7 +405,7 @@ def measure_lattice(
         raise InputError("bin_size", f"{bin_size}", "a length above 0 m")
     maps = np.nan_to_num(np.asarray(autocorrelograms, float))
     period = np.deg2rad(lattice.onto[0])
-    inner = centre_radii(np.ascontiguousarray(maps.transpose(1, 2, 0)))
+    inner = centre_radii(maps)
     count = round(np.pi / period)
     vectors = [_nearest_peaks(image, radius, count) for image, radius in zip(maps, inner, strict=True)]
     spacing = [bin_size * np.abs(peaks).mean() for peaks in vectors]

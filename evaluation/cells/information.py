@@ -8,7 +8,6 @@ formulas p is the share of time in a bin, r the rate there and m = sum p r the m
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import xlogy
 
 from evaluation.cells.rate_map import weigh_bins
 
@@ -20,13 +19,13 @@ def information(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     `information_above_mean`.
     """
     relative, share = _relative(rates, seconds)
-    return (share * xlogy(relative, relative)).sum(axis=1) / np.log(2)
+    return np.vecdot(share, relative * np.log2(np.maximum(relative, np.finfo(float).tiny)))
 
 
 def information_above_mean(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """[n] `information`, summed over the bins above the mean rate alone; the convention of opexebo."""
     relative, share = _relative(rates, seconds)
-    return (share * xlogy(relative, np.maximum(relative, 1.0))).sum(axis=1) / np.log(2)
+    return np.vecdot(share, relative * np.log2(np.maximum(relative, 1.0)))
 
 
 def information_rate(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
@@ -41,7 +40,7 @@ def sparsity(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     Skaggs et al. 1996.
     """
     relative, share = _relative(rates, seconds)
-    return 1 / (share * relative**2).sum(axis=1)
+    return 1 / np.vecdot(share, relative**2)
 
 
 def selectivity(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
@@ -53,13 +52,14 @@ def selectivity(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
 def mean_rate(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """[n] sum p r, in the unit of the rates."""
     rates, share = weigh_bins(rates, seconds)
-    return (share * rates).sum(axis=1)
+    return np.vecdot(share, rates)
 
 
 def _relative(rates: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rates over their mean [n, bins], NaN for a cell without activity, and the share of time [n, bins]."""
+    """Rates over their mean [n, bins], NaN for a cell without activity, and the share of time of
+    `weigh_bins`."""
     rates, share = weigh_bins(rates, seconds)
-    mean = (share * rates).sum(axis=1)
+    mean = np.vecdot(share, rates)
     return rates / np.where(mean > 0, mean, np.nan)[:, None], share
 
 

@@ -77,7 +77,7 @@ def smooth_plane(values: np.ndarray, sigma: float, squared: bool = False) -> np.
     spread; smooth `numpy.nan_to_num(values)` and the mask of visited bins and divide to ignore them.
     """
     height, width = _kernel(values.shape[-2], sigma), _kernel(values.shape[-1], sigma)
-    return height**2 @ values @ width.T**2 if squared else height @ values @ width.T
+    return _multiply(height**2, values, width**2) if squared else _multiply(height, values, width)
 
 
 class BoxSamples(NamedTuple):
@@ -279,19 +279,28 @@ def weigh_bins(rates: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.n
     Args:
         rates: [n, ...] over any bins, NaN where unknown. seconds: [...] time in each bin, s.
 
+    Returns:
+        the share is [1, bins] if all rates know the same bins.
+
     Raises:
         InputError: the bins differ, or no bin has both a rate and time.
     """
     if rates.shape[1:] != seconds.shape:
         raise InputError("seconds", f"bins {seconds.shape}", f"the bins of the rates, {rates.shape[1:]}")
     flat = rates.reshape(len(rates), -1)
-    known = np.isfinite(flat)
+    known = known_bins(flat)
     share = known * np.asarray(seconds, np.float64).reshape(-1)
     total = share.sum(axis=1, keepdims=True)
     if len(rates) and not total.any():
         raise InputError("seconds", "no time in any bin", "time in bins that have a rate", "check the edges")
     share /= np.where(total > 0, total, np.nan)
     return np.where(known, flat, 0.0), share
+
+
+def known_bins(rates: np.ndarray) -> np.ndarray:
+    """[n, ...] bool, the bins of rates [n, ...] that are known; [1, ...] if they are the same in all."""
+    known = np.isfinite(rates)
+    return known[:1] if (known == known[:1]).all() else known
 
 
 def _interval(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -334,7 +343,7 @@ def coherence(rates: np.ndarray, seconds: np.ndarray) -> np.ndarray:
 
 def neighbour_means(rates: np.ndarray) -> np.ndarray:
     """[n, H, W] mean rate of the up to 8 neighbours that have one, NaN without."""
-    known = np.isfinite(rates)
+    known = known_bins(rates)
     count = _sum_neighbours(known.astype(float))
     total = _sum_neighbours(np.where(known, rates, 0.0))
     return total / np.where(count > 0, count, np.nan)
@@ -344,18 +353,24 @@ def correlate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """[n] Pearson correlation of maps a and b [n, ...] over the bins in which both are known, NaN if one is
     flat."""
     a, b = (values.reshape(len(values), -1) for values in (a, b))
-    known = np.isfinite(a) & np.isfinite(b)
+    known = known_bins(a) & known_bins(b)
     count = np.maximum(known.sum(axis=1, keepdims=True), 1)
     a, b = (np.where(known, values, 0.0) for values in (a, b))
     a, b = (np.where(known, values - values.sum(axis=1, keepdims=True) / count, 0.0) for values in (a, b))
-    power = (a * a).sum(axis=1) * (b * b).sum(axis=1)
-    return (a * b).sum(axis=1) / np.sqrt(np.where(power > 0, power, np.nan))
+    power = np.vecdot(a, a) * np.vecdot(b, b)
+    return np.vecdot(a, b) / np.sqrt(np.where(power > 0, power, np.nan))
 
 
 def _sum_neighbours(values: np.ndarray) -> np.ndarray:
     """[n, H, W] sum over the 8 neighbours."""
     height, width = values.shape[-2:]
-    return _band(height) @ values @ _band(width) - values
+    return _multiply(_band(height), values, _band(width)) - values
+
+
+def _multiply(height: np.ndarray, values: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """height [H, H] @ values [..., H, W] @ width.T [W, W]; the second product is one for all values."""
+    rows = values.reshape(-1, len(width)) @ width.T
+    return height @ rows.reshape(values.shape)
 
 
 def _band(bins: int) -> np.ndarray:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -36,6 +36,12 @@ class BinnedSums(NamedTuple):
     place: np.ndarray
     heading_seconds: np.ndarray
     heading: np.ndarray
+
+    def parts(self, cells: int = 256) -> Iterator[Self]:
+        """The sums of so many cells at a time, whose arrays fit the cache."""
+        for start in range(0, max(len(self.place), 1), cells):
+            part = slice(start, start + cells)
+            yield self._replace(place=self.place[part], heading=self.heading[part])
 
 
 class CellRecording(NamedTuple):

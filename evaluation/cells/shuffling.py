@@ -21,6 +21,7 @@ from scipy.stats import binom
 
 from evaluation.cells import rate_map
 from evaluation.cells.recording import CellRecording
+from tactile.base.compiled import compiled
 from tactile.base.errors import InputError
 from tactile.base.random_streams import stream
 
@@ -198,26 +199,32 @@ def calibrate(
 
 
 def _score_shifts(activity: np.ndarray, bins: PathBins, score: Score, shifts: np.ndarray) -> ShuffledScores:
-    """Scores of the cells, and at the shifts [S, C].
-
-    A path stays in a bin for several samples; they are summed first, which is faster.
-    """
+    """Scores of the cells, and at the shifts [S, C]."""
     size = math.prod(bins.shape)
     flat = np.where(bins.flat < 0, size, bins.flat).astype(int)
     seconds = np.bincount(flat, bins.seconds, size + 1)[:size]
-    stays = np.flatnonzero(np.diff(flat, prepend=-1))
-    cells = activity.T.astype(float, order="C")
+    cell, sample = np.nonzero(activity.T)
+    active = activity[sample, cell].astype(float)
 
     def score_at(shift: np.ndarray) -> np.ndarray:
-        sums = np.empty((len(cells), size))
-        for cell, steps in enumerate(shift):
-            stay_sums = np.add.reduceat(np.roll(cells[cell], steps) * bins.seconds, stays)
-            sums[cell] = np.bincount(flat[stays], stay_sums, size + 1)[:size]
-        rates = sums / np.where(seconds > 0, seconds, np.nan)
+        sums = np.zeros((len(shift), size + 1))
+        _add_shifted(sums, cell, sample, active, shift, flat, bins.seconds)
+        rates = sums[:, :size] / np.where(seconds > 0, seconds, np.nan)
         return score(rates.reshape(-1, *bins.shape), seconds.reshape(bins.shape))
 
-    recorded = score_at(np.zeros(len(cells), int))
+    recorded = score_at(np.zeros_like(shifts[0]))
     return ShuffledScores(recorded, np.array([score_at(shift) for shift in shifts]))
+
+
+@compiled
+def _add_shifted(
+    sums: np.ndarray, cell: np.ndarray, sample: np.ndarray, active: np.ndarray, shift: np.ndarray,
+    flat: np.ndarray, seconds: np.ndarray,
+) -> None:  # fmt: skip
+    """Adds what cells do in samples [M], each shifted by that of its cell, to their sums over bins [C, B]."""
+    for each in range(len(active)):
+        at = (sample[each] + shift[cell[each]]) % len(flat)
+        sums[cell[each], flat[at]] += active[each] * seconds[at]
 
 
 def _check_path(activity: np.ndarray, bins: PathBins) -> None:

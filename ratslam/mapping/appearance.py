@@ -16,7 +16,6 @@ import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
 from ratslam.core.backend import Evidence
-from ratslam.core.compiled import compiled
 from ratslam.mapping.ground import NEAR, GainPrior
 from ratslam.mapping.odometry_calibration import NO_ESTIMATE, BiasEstimate, SectorFan
 from ratslam.recall.memory import NO_LIKENESS
@@ -30,6 +29,7 @@ from ratslam.recall.whisker_likelihood import (
     log_odds_table,
     pixel_levels,
 )
+from tactile.base.compiled import compiled
 from tactile.base.types import Observation
 
 BIAS_INTERVAL = 16

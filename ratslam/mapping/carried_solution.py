@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ratslam.core.compiled import compiled, wrapped
 from ratslam.mapping.closure_selection import CUT, MapHypotheses, Selection, SelectionProblem
 from ratslam.mapping.ground import (
     EVEN,
@@ -35,6 +34,7 @@ from ratslam.mapping.map_solution import selected_map, selection_problem, sequen
 from ratslam.mapping.map_state import MapState
 from ratslam.mapping.optimizer import MapFit, MapProblem, System
 from ratslam.mapping.verification import turn_on_spot
+from tactile.base.compiled import compiled, wrapped
 from tactile.base.se2 import inverse
 
 ROUNDS = 3

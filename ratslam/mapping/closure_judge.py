@@ -25,7 +25,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
-from ratslam.core.compiled import compiled
 from ratslam.mapping.ground import (
     EVEN,
     MOST_REACH,
@@ -38,6 +37,7 @@ from ratslam.mapping.ground import (
 from ratslam.mapping.loop_closures import Verdict
 from ratslam.mapping.map_state import MapState
 from ratslam.mapping.odometry_scan import log_ratio
+from tactile.base.compiled import compiled
 from tactile.base.se2 import correct_heading, integrate, inverse
 
 AT_ONCE = 1.0

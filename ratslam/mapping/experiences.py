@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
-from ratslam.core.compiled import compiled, wrapped
 from ratslam.core.estimates import Action
+from tactile.base.compiled import compiled, wrapped
 from tactile.base.se2 import between, compose
 
 if TYPE_CHECKING:

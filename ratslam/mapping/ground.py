@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
-from ratslam.core.compiled import compiled, wrapped
+from tactile.base.compiled import compiled, wrapped
 from tactile.base.se2 import compose, inverse, wrap
 
 REACH = 1.2

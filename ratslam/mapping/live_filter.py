@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed
-from ratslam.core.compiled import compiled, wrapped
 from ratslam.mapping.loop_closures import Candidate
 from ratslam.mapping.map_state import MapState
+from tactile.base.compiled import compiled, wrapped
 
 LEAST_WEIGHT = 0.05
 """Least robust weight of a sequence in the filter."""

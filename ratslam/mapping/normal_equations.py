@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
-from ratslam.core.compiled import compiled
+from tactile.base.compiled import compiled
 
 
 class BlockPattern:

@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ratslam.core.arrays import Checkpointed, GrowableArray
-from ratslam.core.compiled import compiled
 from ratslam.mapping.config import KeyframeMapConfig
 from ratslam.mapping.optimizer import CalibrationPrior, MapFit, MapProblem, System
+from tactile.base.compiled import compiled
 
 FIELDS_OF_VIEW = np.radians([sign * width for width in (60, 90, 120, 180, 240, 270, 360) for sign in (1, -1)])
 """Candidate fields of view, rad; negative: clockwise."""

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ratslam.core.compiled import compiled
 from ratslam.mapping.map_state import MapState
 from ratslam.mapping.optimizer import CalibrationPrior
+from tactile.base.compiled import compiled
 
 BIAS_SPAN, BIAS_STEPS = 0.06, 241
 """Largest difference of a heading bias of the grid from the prior's, rad per cell, and number of biases."""

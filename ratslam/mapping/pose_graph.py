@@ -17,9 +17,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order
 
-from ratslam.core.compiled import compiled
 from ratslam.mapping.normal_equations import BlockPattern, elimination_order
 from tactile.base.bounded import SPOILT, malformed, read_text
+from tactile.base.compiled import compiled
 from tactile.base.se2 import wrap
 
 if TYPE_CHECKING:

@@ -237,7 +237,7 @@ def test_lags_with_few_common_bins_and_flat_maps_have_no_correlation_and_the_cen
     assert np.isnan(result[2:]).all()
     y, x = np.mgrid[-17:18, -17:18]
     widths = np.array([1.5, 3.0, 5.0])
-    radii = scores.centre_radii(np.exp(-(x**2 + y**2)[..., None] / 2 / widths**2))
+    radii = scores.centre_radii(np.exp(-(x**2 + y**2) / 2 / widths[:, None, None] ** 2))
     np.testing.assert_allclose(radii, np.floor(np.sqrt(2 * np.log(1 / 0.2)) * widths), atol=1)
 
 
