@@ -49,7 +49,7 @@ def find_fields(rates: np.ndarray, share: float = 0.2, least_bins: int = 9) -> F
     """
     if rates.ndim != 3:
         raise InputError("rates", f"an array of {rates.ndim} dimensions", "[cells, H, W]")
-    filled = np.nan_to_num(rates)
+    filled = np.where(np.isfinite(rates), rates, 0.0)
     peak = filled.max(axis=(1, 2), keepdims=True)
     sides = np.zeros((3, 3, 3), int)
     sides[1] = [[0, 1, 0], [1, 1, 1], [0, 1, 0]]
@@ -119,6 +119,6 @@ def wall_distance(rates: np.ndarray, fields: Fields) -> np.ndarray:
     height, width = rates.shape[1:]
     down, right = (np.minimum(np.arange(n), np.arange(n)[::-1]) + 1.0 for n in (height, width))
     distance = np.minimum(down[:, None], right[None])
-    inside = np.where(fields.label > 0, np.nan_to_num(rates), 0.0).reshape(len(rates), -1)
+    inside = np.where(fields.label > 0, rates, 0.0).reshape(len(rates), -1)
     total = inside.sum(axis=1)
     return 2 * (inside @ distance.ravel()) / np.where(total > 0, total, 1.0) / min(height, width)

@@ -286,67 +286,68 @@ def score_lattices(autocorrelograms: np.ndarray, lattices: Sequence[Lattice]) ->
     found = (inner > 0) & (inner < min(height, width) // 2)
     scores = np.full((len(lattices), len(autocorrelograms)), np.nan)
     for k, lattice in enumerate(lattices):
-        curves = _curves(maps[found], inner[found], _annuli(lattice, height, width))
-        onto = len(lattice.onto)
-        curves = curves[:onto].min(axis=0) - curves[onto:].max(axis=0)
-        scores[k, valid[found]] = _best(curves, inner[found])
+        annuli, onto = _annuli(lattice, height, width), len(lattice.onto)
+        scores[k, valid[found]] = _score_annuli(maps[found], inner[found], annuli, onto)
     return scores
 
 
 @compiled
-def _curves(maps: np.ndarray, inner: np.ndarray, annuli: _Annuli) -> np.ndarray:
-    """Correlations [A, R + 1, n] of the annuli from `inner` [n] to each outer radius 0 .. R, bins, with
-    themselves after rotations; NaN where they are flat. maps: [n, h, w]."""
-    (count, _, width), angles, radii = maps.shape, annuli.corners.shape[1], len(annuli.below)
-    curves = np.full((angles, radii, count), np.nan)
-    for k in range(count):
-        image, last = maps[k].ravel(), annuli.within[inner[k]]
-        first, total, square, turned = last, 0.0, 0.0, np.zeros((angles, 3))
-        for radius in range(inner[k] + 1, radii):
-            for p in range(last, annuli.below[radius]):
-                value = image[annuli.half[p]]
-                total += value
-                square += value * value
-                for angle in range(angles):
-                    at, (a, b, c, d) = annuli.corners[p, angle], annuli.weights[p, angle]
-                    other = (
-                        a * image[at] + b * image[at + 1] + c * image[at + width] + d * image[at + width + 1]
-                    )
-                    turned[angle, 0] += other
-                    turned[angle, 1] += other * other
-                    turned[angle, 2] += other * value
-            last = annuli.below[radius]
-            bins = max(last - first, 1)
-            variance = square / bins - (total / bins) ** 2
-            for angle in range(angles):
-                mean, power, product = turned[angle] / bins
-                other = power - mean**2
-                if variance * bins > _FLAT * square and other > _FLAT * power:
-                    covariance = product - mean * total / bins
-                    curves[angle, radius, k] = covariance / np.sqrt(variance * other)
-    return np.clip(curves, -1.0, 1.0)
-
-
-def _best(curves: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """The best mean score [n] over three successive outer radii, of curves [R + 1, n].
+def _score_annuli(maps: np.ndarray, inner: np.ndarray, annuli: _Annuli, onto: int) -> np.ndarray:
+    """Scores [n] of maps [n, h, w]: the best mean over three successive outer radii of annuli from `inner`
+    [n]; so many of the angles map the lattice onto itself.
 
     As in opexebo: the last window of three is left out, flat annuli are left out of a window, and the
     mean over all radii is taken where they are four or fewer.
     """
-    scores = np.full(len(inner), np.nan)
-    outer = len(curves) - 1
-    for radius in np.unique(inner):
-        of_radius = inner == radius
-        radii = np.linspace(max(3, radius + 1), outer, outer - radius).astype(int)
-        curve = curves[radii][:, of_radius]
-        if len(radii) <= 4:
-            scores[of_radius] = curve.mean(axis=0)
+    scores, outer = np.full(len(maps), np.nan), len(annuli.below) - 1
+    for k in range(len(maps)):
+        curve = _curve(maps[k], inner[k], annuli, onto)
+        first = max(3, inner[k] + 1)
+        count = outer - inner[k]
+        curve = np.array([curve[int(radius)] for radius in np.linspace(first, outer, count)])
+        if count <= 4:
+            scores[k] = curve.mean()
             continue
-        windows = np.lib.stride_tricks.sliding_window_view(curve, 3, axis=0)[:-1]
-        known = np.isfinite(windows).sum(axis=2)
-        mean = np.nansum(windows, axis=2) / np.where(known > 0, known, np.nan)
-        scores[of_radius] = mean.max(axis=0)
+        windows = [np.nanmean(curve[start : start + 3]) for start in range(count - 3)]
+        scores[k] = np.array(windows).max()
     return scores
+
+
+@compiled
+def _curve(image: np.ndarray, inner: int, annuli: _Annuli, onto: int) -> np.ndarray:
+    """Scores [R + 1] of the annuli of a map [h, w] from `inner` to each outer radius 0 .. R, bins; NaN where
+    they are flat."""
+    curve, width, image = np.full(len(annuli.below), np.nan), image.shape[1], image.ravel()
+    first = last = annuli.within[inner]
+    total, square, turned = 0.0, 0.0, np.zeros((annuli.corners.shape[1], 3))
+    for radius in range(inner + 1, len(curve)):
+        for p in range(last, annuli.below[radius]):
+            value = image[annuli.half[p]]
+            total += value
+            square += value * value
+            for angle in range(len(turned)):
+                at, (a, b, c, d) = annuli.corners[p, angle], annuli.weights[p, angle]
+                other = a * image[at] + b * image[at + 1] + c * image[at + width] + d * image[at + width + 1]
+                turned[angle, 0] += other
+                turned[angle, 1] += other * other
+                turned[angle, 2] += other * value
+        last = annuli.below[radius]
+        bins = max(last - first, 1)
+        variance = square / bins - (total / bins) ** 2
+        lowest, highest = np.inf, -np.inf
+        flat = variance * bins <= _FLAT * square
+        for angle in range(len(turned)):
+            mean, power, product = turned[angle] / bins
+            flat |= power - mean**2 <= _FLAT * power
+            correlation = (product - mean * total / bins) / np.sqrt(variance * (power - mean**2))
+            correlation = min(max(correlation, -1.0), 1.0)
+            if angle < onto:
+                lowest = min(lowest, correlation)
+            else:
+                highest = max(highest, correlation)
+        if not flat:
+            curve[radius] = lowest - highest
+    return curve
 
 
 @lru_cache(maxsize=16)

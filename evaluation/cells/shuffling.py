@@ -203,7 +203,7 @@ def _score_shifts(activity: np.ndarray, bins: PathBins, score: Score, shifts: np
     size = math.prod(bins.shape)
     flat = np.where(bins.flat < 0, size, bins.flat).astype(int)
     seconds = np.bincount(flat, bins.seconds, size + 1)[:size]
-    cell, sample = np.nonzero(activity.T)
+    sample, cell = np.nonzero(activity)
     active = activity[sample, cell].astype(float)
 
     def score_at(shift: np.ndarray) -> np.ndarray:
@@ -212,7 +212,7 @@ def _score_shifts(activity: np.ndarray, bins: PathBins, score: Score, shifts: np
         rates = sums[:, :size] / np.where(seconds > 0, seconds, np.nan)
         return score(rates.reshape(-1, *bins.shape), seconds.reshape(bins.shape))
 
-    recorded = score_at(np.zeros_like(shifts[0]))
+    recorded = score_at(np.zeros(activity.shape[1], int))
     return ShuffledScores(recorded, np.array([score_at(shift) for shift in shifts]))
 
 
@@ -221,7 +221,8 @@ def _add_shifted(
     sums: np.ndarray, cell: np.ndarray, sample: np.ndarray, active: np.ndarray, shift: np.ndarray,
     flat: np.ndarray, seconds: np.ndarray,
 ) -> None:  # fmt: skip
-    """Adds what cells do in samples [M], each shifted by that of its cell, to their sums over bins [C, B]."""
+    """Adds the activity [M] of cells in samples, moved by the shifts [C] of the cells, to sums [C, B] over the
+    bins [T] of the samples there, times their seconds [T]."""
     for each in range(len(active)):
         at = (sample[each] + shift[cell[each]]) % len(flat)
         sums[cell[each], flat[at]] += active[each] * seconds[at]

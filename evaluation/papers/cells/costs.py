@@ -12,7 +12,7 @@ import numpy as np
 
 from evaluation.cells.analysis import analyse_cells
 from evaluation.cells.head_direction import mean_vector_length, rayleigh_p
-from evaluation.cells.information import information, information_rate
+from evaluation.cells.information import information, mean_rate
 from evaluation.cells.rate_map import rate_maps, tuning_curves
 from evaluation.cells.recording import CellRecording
 from evaluation.cells.shuffling import path_bins, shuffled_scores
@@ -65,12 +65,11 @@ def measure_analysis(
 def _map_and_tune(recording: CellRecording) -> None:
     """Rate maps, spatial information and head-direction tuning of all cells of the sums."""
     assert recording.sums is not None
-    maps, curves = rate_maps(recording.sums), tuning_curves(recording.sums)
-    hz = len(maps)
-    information(maps, recording.sums.seconds)
-    information_rate(maps, recording.sums.seconds)
-    mean_vector_length(curves, recording.sums.heading_seconds)
-    rayleigh_p(curves * hz, recording.sums.heading_seconds)
+    for part in recording.sums.parts():
+        maps, curves = rate_maps(part), tuning_curves(part)
+        information(maps, part.seconds) * mean_rate(maps, part.seconds)
+        mean_vector_length(curves, part.heading_seconds)
+        rayleigh_p(curves * len(recording.sums.place), part.heading_seconds)
 
 
 def _table_analysis(result: tuple[str, Times]) -> list[str]:

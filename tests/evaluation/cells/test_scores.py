@@ -205,10 +205,22 @@ def test_gain_turns_activity_into_spikes_and_sums_are_scored_as_time_series() ->
     for name, a, b in zip(chosen._fields, chosen, whole, strict=True):
         assert name == "speed" or np.allclose(a, b, atol=1e-12, equal_nan=True), name
     assert np.isnan(whole.speed).all()
+    many = sums._replace(place=np.tile(sums.place, (30, 1, 1)), heading=np.tile(sums.heading, (30, 1)))
+    again = analyse_cells(none._replace(shape=(300, 1, 1), sums=many), gain=10)
+    for name in ("peak_rate", "grid", "heading_information"):
+        assert_allclose(getattr(again, name), np.tile(getattr(chosen, name), 30), atol=1e-12)
     with pytest.raises(InputError, match="no cells"):
         analyse_cells(none)
     with pytest.raises(InputError, match="one column"):
         analyse_cells(one._replace(activity=one.activity[:, :5]))
+
+
+@pytest.mark.parametrize("score", [information, sparsity, selectivity, coherence, head_direction.peak_rate])
+def test_a_map_with_known_bins_of_its_own_is_scored_as_alone(score):
+    maps = np.random.default_rng(0).random((3, 20, 20))
+    maps[0, 3, 4] = maps[1, 7, :] = np.nan
+    alone = [score(each[None], SECONDS)[0] for each in maps]
+    assert_allclose(score(maps, SECONDS), alone, atol=1e-12)
 
 
 @given(SEEDS, st.integers(0, 12))
