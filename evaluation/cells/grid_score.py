@@ -76,8 +76,8 @@ def _correlate(values: np.ndarray, visited: np.ndarray, reach: tuple[int, int]) 
     size = fft.next_fast_len(shape[0]), fft.next_fast_len(shape[1], real=True)
     of_mask, of_values, of_squares = (fft.rfft2(part, size) for part in (visited * 1.0, values, values**2))
     pairs = (of_mask, of_mask), (of_mask, of_values), (of_mask, of_squares), (of_values, of_values)
-    common, *sums = (fft.irfft2(np.conj(left) * right, size) for left, right in pairs)
-    return _at_lags(np.round(common), *sums, values.shape[1:], reach)
+    common, total, square, product = (fft.irfft2(np.conj(left) * right, size) for left, right in pairs)
+    return _at_lags(np.round(common), total, square, product, values.shape[1:], reach)
 
 
 @compiled
@@ -132,7 +132,7 @@ def _schedules() -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     tried, as indices of thresholds: two of whose areas the ratio is the ordinary growth, and the falling
     ones."""
     growths = [(0.95, 0.95 - 0.02)] + [(high, high - 0.01) for high in np.linspace(0.96, 1.0, 4)]
-    schedules = []
+    schedules: list[np.ndarray] = []
     for high, low in growths:
         first = high if high == 0.95 else low
         steps = np.round(np.linspace(first, 0.2, int((first - 0.2) / 0.02) + 1), 2)

@@ -221,8 +221,8 @@ def _add_shifted(
     sums: np.ndarray, cell: np.ndarray, sample: np.ndarray, active: np.ndarray, shift: np.ndarray,
     flat: np.ndarray, seconds: np.ndarray,
 ) -> None:  # fmt: skip
-    """Adds the activity [M] of cells in samples, moved by the shifts [C] of the cells, to sums [C, B] over the
-    bins [T] of the samples there, times their seconds [T]."""
+    """Adds the activity [M] of cells in samples, moved by the shifts [C] of the cells, to sums [C, B] over
+    the bins [T] of the samples there, times their seconds [T]."""
     for each in range(len(active)):
         at = (sample[each] + shift[cell[each]]) % len(flat)
         sums[cell[each], flat[at]] += active[each] * seconds[at]
