@@ -56,6 +56,8 @@ def autocorrelogram(rates: np.ndarray) -> np.ndarray:
     # The largest kept lags.
     down, right = ((int(np.round(side + side * _OVERLAP)) - 1) // 2 for side in rates.shape[1:])
     maps = np.empty((len(rates), 2 * down + 1, 2 * right + 1))
+    height, width = rates.shape[1:]
+    size = fft.next_fast_len(height + down), fft.next_fast_len(width + right, real=True)
     for start in range(0, len(rates), _MAPS_AT_ONCE):
         batch = slice(start, start + _MAPS_AT_ONCE)
         visited = known_bins(rates[batch])
@@ -65,19 +67,15 @@ def autocorrelogram(rates: np.ndarray) -> np.ndarray:
         values = np.where(visited, filled - filled.sum(axis=(1, 2), keepdims=True) / count, 0.0)
         scale = np.sqrt((values**2).sum(axis=(1, 2), keepdims=True) / count)
         flat = scale <= _FLAT * np.abs(filled).max(axis=(1, 2), keepdims=True)
-        maps[batch] = _correlate(values / np.where(flat, 1.0, scale), visited, (down, right))
+        values /= np.where(flat, 1.0, scale)
+        of_mask, of_values, of_squares = (
+            fft.rfft2(part, size) for part in (visited * 1.0, values, values**2)
+        )
+        pairs = (of_mask, of_mask), (of_mask, of_values), (of_mask, of_squares), (of_values, of_values)
+        common, total, square, product = (fft.irfft2(np.conj(left) * right, size) for left, right in pairs)
+        maps[batch] = _at_lags(np.round(common), total, square, product, rates.shape[1:], (down, right))
         maps[batch][flat[:, 0, 0]] = np.nan
     return maps
-
-
-def _correlate(values: np.ndarray, visited: np.ndarray, reach: tuple[int, int]) -> np.ndarray:
-    """Correlations [n, h, w] at the kept lags."""
-    shape = [side + kept for side, kept in zip(values.shape[1:], reach, strict=True)]
-    size = fft.next_fast_len(shape[0]), fft.next_fast_len(shape[1], real=True)
-    of_mask, of_values, of_squares = (fft.rfft2(part, size) for part in (visited * 1.0, values, values**2))
-    pairs = (of_mask, of_mask), (of_mask, of_values), (of_mask, of_squares), (of_values, of_values)
-    common, total, square, product = (fft.irfft2(np.conj(left) * right, size) for left, right in pairs)
-    return _at_lags(np.round(common), total, square, product, values.shape[1:], reach)
 
 
 @compiled

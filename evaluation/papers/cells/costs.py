@@ -65,11 +65,12 @@ def measure_analysis(
 def _map_and_tune(recording: CellRecording) -> None:
     """Rate maps, spatial information and head-direction tuning of all cells of the sums."""
     assert recording.sums is not None
+    hz = len(recording.sums.place)
     for part in recording.sums.parts():
         maps, curves = rate_maps(part), tuning_curves(part)
         information(maps, part.seconds) * mean_rate(maps, part.seconds)
         mean_vector_length(curves, part.heading_seconds)
-        rayleigh_p(curves * len(recording.sums.place), part.heading_seconds)
+        rayleigh_p(curves * hz, part.heading_seconds)
 
 
 def _table_analysis(result: tuple[str, Times]) -> list[str]:
