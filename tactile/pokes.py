@@ -46,6 +46,7 @@ class PokeConfig(Settings):
     """Threshold of the rise: its mean in free air and so many of its standard deviations there."""
 
 
+DEFAULT_POKES = PokeConfig()
 TURN_LENGTH = 0.1
 """Way that a turn of 1 rad counts as, m."""
 FLOOR = 1 / 30

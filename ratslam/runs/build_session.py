@@ -110,7 +110,7 @@ def open_source(
     if config.recording is None or config.recording.file is None:
         cure = "`python -m ratslam live` runs it; `run` maps the recording that it makes"
         raise InputError("live", "a live session", "a recording or a simulation", cure)
-    return open_recording(config.recording, _warning(report, warnings))
+    return open_recording(config.recording, _warning(report, warnings), config.touch.pokes)
 
 
 def _warning(report: Callable[[str], None] | None, warnings: list[str] | None) -> Callable[[str], None]:

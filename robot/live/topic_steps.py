@@ -19,26 +19,27 @@ import numpy as np
 
 from robot.drivers.outcome import SessionOutcome
 from robot.live.polling import session_fault
-from robot.live.topics_client import Channel, Received
-from robot.recordings.bags.bag import Messages, Topic, learn_type
+from robot.live.topics_client import LiveMessages
+from robot.recordings.bags.bag import Messages, Topic
 from robot.recordings.bags.bag_reader import TOUCHES, TouchReader
 from robot.recordings.bags.topics_config import TopicsConfig
 from robot.recordings.bags.transforms import POSES, TWISTS, frames_of, holds_velocities, value_of
 from robot.recordings.bags.views import CLOUD, COVERED, IMAGES, SCAN, RangeReader, grey_image
+from robot.recordings.bags.wrench_pokes import WRENCHES, PokeReader, force_of
 from robot.recordings.cdr import PIECE
 from robot.recordings.input_judge import GAP, JUMP, LEAST_GAP, InputJudge, MotionTrack, UnitLimits
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.video import image_view
+from robot.sources.in_memory import NO_ODOMETRY
 from robot.sources.odometry import from_poses, from_velocities
 from robot.sources.source import Sample
 from tactile.base.errors import InputError
 from tactile.base.se2 import between, compose, integrate, inverse, wrap
-from tactile.base.types import Odometry, observation
+from tactile.base.types import Observation, Odometry, observation
+from tactile.pokes import DEFAULT_POKES, PokeConfig, ring_time
 
 HISTORY = 30.0
 """Time for which odometry is kept, s: the largest delay of a view."""
-KEPT = 256
-"""Moving transforms of a topic that are kept, for the mount of a sensor."""
 TURN_LENGTH = 0.5
 """A turn counts as this much way, m/rad, where poses are compared."""
 RESTART = 3.0
@@ -49,104 +50,6 @@ WAITING = 256
 """Views that wait for odometry, at most."""
 JUDGED, MOST_PIECES = 512, 4
 """Messages of odometry that are judged together, and how many of them may begin a piece."""
-
-
-class LiveMessages(Messages):
-    """Decodes the messages of a running robot, and keeps its transforms.
-
-    Args:
-        address: of the robot. say: called with one sentence for whatever is doubtful; once for each.
-
-    Attributes:
-        counts: messages so far, by topic.
-    """
-
-    def __init__(self, address: str, config: TopicsConfig, say: Callable[[str], None]) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self.path, self.clock, self.topics, self._say = address, config.clock, {}, say
-        self.counts = Counter[str]()
-        self._told = set[str]()
-        self._stores: dict[str, Any] = {"cdr": get_typestore(Stores.ROS2_HUMBLE)}
-        self._kept: dict[str, list[tuple[int, int, Any]]] = {}
-        self._definitions: dict[str, str] = {}
-        self._moves: dict[str, Any] = {}  # of ROS 1 to ROS 2, as rosbags keeps them
-
-    def warn(self, sentence: str) -> None:
-        if sentence not in self._told:
-            self._say(sentence)
-        self._told.add(sentence)
-
-    def list_topics(self, channels: dict[str, Channel]) -> None:
-        """Sets the topics to those that the robot advertises."""
-        for channel in channels.values():
-            if channel.encoding == "ros1" and "ros1" not in self._stores:
-                from rosbags.typesys import Stores, get_typestore
-
-                self._stores["ros1"] = get_typestore(Stores.ROS1_NOETIC)
-            told = channel.definition and channel.notation != "ros2idl"
-            for store in self._stores.values() if told else ():
-                learn_type(store, channel.kind, channel.definition)
-        # That messages come is awaited, not asked.
-        self.topics = {name: Topic(name, channel.kind, 1) for name, channel in sorted(channels.items())}
-
-    def readable(self, channel: Channel) -> bool:
-        """Whether messages of a topic can be decoded."""
-        return channel.encoding in self._stores and channel.kind in self._stores["cdr"].fielddefs
-
-    def definition(self, channel: Channel) -> str:
-        """The definition of the messages of a topic, as ROS 2 writes it."""
-        if channel.kind not in self._definitions:
-            text = channel.definition if channel.notation == "ros2msg" else ""
-            written = self._stores["cdr"].generate_msgdef(channel.kind, ros_version=2)[0]
-            self._definitions[channel.kind] = text or written
-        return self._definitions[channel.kind]
-
-    def in_cdr(self, received: Received) -> bytes:
-        """A message as ROS 2 encodes it.
-
-        Raises:
-            InputError: it cannot be decoded.
-        """
-        channel = received.channel
-        if channel.encoding == "cdr":
-            return received.content
-        from rosbags.convert.converter import migrate_bytes
-
-        stores = self._stores["ros1"], self._stores["cdr"]
-        try:
-            kinds = channel.kind, channel.kind
-            return bytes(
-                migrate_bytes(*stores, *kinds, self._moves, received.content, src_is2=False, dst_is2=True)
-            )
-        except Exception as error:  # whatever a decoder raises for damaged bytes
-            raise self._damage(channel, received.content, error) from error
-
-    def decode(self, channel: Channel, content: bytes) -> Any:
-        """The content of a message in CDR.
-
-        Raises:
-            InputError: it cannot be decoded.
-        """
-        try:
-            return self._stores["cdr"].deserialize_cdr(content, channel.kind)
-        except Exception as error:  # whatever a decoder raises for damaged bytes
-            raise self._damage(channel, content, error) from error
-
-    def keep(self, topic: str, time: int, content: Any) -> None:
-        """Keeps a message with transforms."""
-        kept = self._kept.setdefault(topic, [])
-        if topic.endswith("tf_static") or len(kept) < KEPT:
-            kept.append((len(kept), time, content))
-
-    def usable(self, topic: Topic, read: Callable[[Any, str], Any]) -> Iterator[tuple[int, int, Any, Any]]:
-        for number, time, content in self._kept.get(topic.name, []):
-            yield number, time, content, read(content, f"{self.path}, {topic.name}, message {number}")
-
-    def _damage(self, channel: Channel, content: bytes, error: Exception) -> InputError:
-        words = " ".join(str(error).split())[:200] or type(error).__name__
-        found = f"{len(content)} bytes that cannot be decoded ({words})"
-        return InputError(f"{self.path}, {channel.topic}", found, f"a message of type {channel.kind}")
 
 
 class Row(NamedTuple):
@@ -162,14 +65,15 @@ class OdometryTrack:
     """The path of the robot, message by message, with the bits of `read_odometry` and `integrate`.
 
     Args:
-        held: whether values are velocities. every: joins this many messages to one row.
+        held: whether values are velocities. every: joins this many messages to one row. history: time for
+            which rows are kept, s.
 
     Attributes:
-        held: as given. rows: of the last `HISTORY` s. piece: number of pieces begun so far.
+        held: as given. rows: of the last `history` s. piece: number of pieces begun so far.
     """
 
-    def __init__(self, held: bool, every: int, limits: UnitLimits) -> None:
-        self.held, self._every, self._limits = held, every, limits
+    def __init__(self, held: bool, every: int, limits: UnitLimits, history: float) -> None:
+        self.held, self._every, self._limits, self._history = held, every, limits, history
         self.rows = deque[Row]()
         self.piece = 0
         self._count = 0
@@ -253,7 +157,7 @@ class OdometryTrack:
             self._turns += (np.pi if within == -np.pi and step > 0 else within) - step
         self._heading = heading
         self.rows.append(Row(time, (x, y, heading + self._turns), self.piece))
-        while self.rows[0].time < time - HISTORY:
+        while self.rows[0].time < time - self._history:
             self.rows.popleft()
 
     def _judge(self, dt: float, step: np.ndarray | None, new: np.ndarray, outage: bool) -> tuple[str, str]:
@@ -310,11 +214,11 @@ class _Path:
 
 
 class _View(NamedTuple):
-    """A view that waits for odometry. Attributes: time: stamp, s. arrival: ns. pixels: [R, C, 1]."""
+    """A view that waits for odometry. Attributes: time: stamp, s. arrival: ns. reading: without motion."""
 
     time: float
     arrival: int
-    pixels: np.ndarray
+    reading: Observation
 
 
 class Begun(NamedTuple):
@@ -330,7 +234,8 @@ class TopicSteps:
     """Makes samples of the messages of a robot.
 
     Args:
-        config: topics and images. messages: of the robot. say: is told of events, by name and text.
+        config: topics and images. messages: of the robot. say: is told of events, by name and text. pokes:
+            of another program, for `topics.wrench`.
 
     Attributes:
         topics: names of those that are used, besides transforms. odometry: name of its topic.
@@ -344,17 +249,24 @@ class TopicSteps:
         messages: LiveMessages,
         max_wait: float,
         say: Callable[[str, str], None],
+        pokes: PokeConfig = DEFAULT_POKES,
     ) -> None:
         assert config.topics is not None
         self._config, self._topics, self._messages, self._say = config, config.topics, messages, say
         self._wait, self._chosen = max_wait, chosen_topics(config.topics, messages)
         self.topics = {topic.name for topic in self._chosen.values()}
         self.odometry = self._chosen["odometry"].name
-        self._seen = next(self._chosen[name].name for name in ("views", "touch") if name in self._chosen)
+        self._seen = next(self._chosen[name].name for name in SEEN if name in self._chosen)
         odometry = self._topics.odometry
         assert odometry is not None
         held = holds_velocities(odometry, self._chosen["odometry"].kind)
-        self.track = OdometryTrack(held, odometry.every, config.limits)
+        wrench, history = self._topics.wrench, HISTORY
+        self._pokes = None if wrench is None else PokeReader(pokes, wrench, messages.warn)
+        self._forces = deque[tuple[float, int, tuple[float, float, float]]]()  # time, arrival, N
+        self._piece = 0  # of the last force
+        if wrench is not None:  # its ring is known once the tool has left
+            history += ring_time(pokes)
+        self.track = OdometryTrack(held, odometry.every, config.limits, history)
         self._body: str | None = None  # of the first odometry message
         self._early = deque[tuple[int, int, Any, str]](maxlen=WAITING)  # views before it
         self._views = deque[_View](maxlen=WAITING)
@@ -367,10 +279,12 @@ class TopicSteps:
         self._recent = deque[tuple[float, ...]](maxlen=JUDGED)  # time and value of odometry
         self._pieces = deque[bool](maxlen=JUDGED)  # whether each began a piece
         self.dropped = Counter[str]()
-        self.shape, self.whiskers = self._known_shape()
+        self.shape, self.whiskers = self._known_shape(pokes)
 
-    def _known_shape(self) -> tuple[tuple[int, int, int] | None, int]:
+    def _known_shape(self, pokes: PokeConfig) -> tuple[tuple[int, int, int] | None, int]:
         views, touch = self._topics.views, self._topics.touch
+        if self._pokes is not None:
+            return (1, pokes.directions, 1), pokes.directions
         if touch is not None:
             if touch.rows is None or touch.columns is None:
                 return None, 0
@@ -382,7 +296,7 @@ class TopicSteps:
     @property
     def mounted(self) -> bool:
         """Whether the first view was seen, for whose sensor the transforms are."""
-        return self._reader is not None
+        return self._reader is not None or self._pokes is not None
 
     def interrupt(self) -> None:
         """Says that the connection was lost: messages may be missing."""
@@ -404,7 +318,11 @@ class TopicSteps:
             self._add_odometry(topic, arrival, content, place)
         if topic == self._seen:
             stamp = messages.stamp(content, arrival)
-            if self._body is None:
+            if self._pokes is not None:
+                force = force_of(content, place)
+                if self._in_order(topic, stamp, arrival):
+                    self._forces.append((stamp / 10**9, arrival, force))
+            elif self._body is None:
                 self._early.append((stamp, arrival, content, place))
             elif self._in_order(topic, stamp, arrival):
                 self._add_view(stamp, arrival, content, place)
@@ -415,15 +333,15 @@ class TopicSteps:
         Args:
             late: whether the mapper lags, so that views are dropped.
         """
-        track = self.track
+        self._feel(now)
         while self._views:
             view = self._views[0]
-            if view.time > track.newest:
+            if view.time > self.track.newest:
                 if now - view.arrival <= self._wait * 1e9:
                     return
                 self._drop("odometry late")
                 continue
-            found = track.at(view.time)
+            found = self.track.at(view.time)
             if found is None:
                 self._drop("outside the odometry")
             elif late():
@@ -432,6 +350,26 @@ class TopicSteps:
                 self._views.popleft()
                 yield self._sample(view, *found)
 
+    def _feel(self, now: int) -> None:
+        """Passes on the forces for which the pose of the tool is known by now; its rings become views."""
+        pokes = self._pokes
+        while pokes is not None and self._forces:
+            time, arrival, force = self._forces[0]
+            if time > self.track.newest and now - arrival <= self._wait * 1e9:
+                return
+            self._forces.popleft()
+            found = self.track.at(time)
+            if found is None:
+                self._lose("force", "without odometry")
+                continue
+            pose, piece = found
+            if piece != self._piece:
+                self._piece = piece
+                pokes.interrupt()
+            pokes.add((time, *pose.tolist(), *force))
+            while pokes.rings:
+                self._views.append(_View(pokes.rings[0][0], arrival, pokes.rings.popleft()[1]))
+
     def _sample(self, view: _View, pose: np.ndarray, piece: int) -> Begun:
         motion, begins, took = np.zeros(3), False, 0.0
         if self._before is not None:
@@ -439,16 +377,18 @@ class TopicSteps:
             begins, took = piece != last, view.time - time
             motion = np.zeros(3) if begins else between(before, pose)
         self._before = view.time, pose, piece
-        assert self.shape is not None
-        moved = Odometry._make((*motion, took))
-        reading = observation(moved, view.pixels, view_shape=self.shape, whiskers=self.whiskers)
+        moved = Odometry._make(np.float64(value) for value in (*motion, took))
+        reading = view.reading._replace(odometry=moved)
         return Begun(Sample(view.time, reading, None), begins, self.track.in_own_frame(pose))
 
     def _drop(self, cause: str) -> None:
         self._views.popleft()
+        self._lose("views", cause)
+
+    def _lose(self, what: str, cause: str) -> None:
         self.dropped[cause] += 1
         if self.dropped[cause] in (1, 10, 100) or self.dropped[cause] % 1000 == 0:
-            self._say("dropped", f"{self.dropped[cause]} views so far: {cause}")
+            self._say("dropped", f"{self.dropped[cause]} {what} so far: {cause}")
 
     def _in_order(self, topic: str, stamp: int, arrival: int) -> bool:
         """Whether a stamp is later than those before.
@@ -527,7 +467,9 @@ class TopicSteps:
             return
         if len(self._views) == WAITING:
             self._drop("odometry late")
-        self._views.append(_View(stamp / 10**9, arrival, pixels))
+        assert self.shape is not None
+        reading = observation(NO_ODOMETRY, pixels, view_shape=self.shape, whiskers=self.whiskers)
+        self._views.append(_View(stamp / 10**9, arrival, reading))
 
     def pixels(self, content: Any, place: str) -> np.ndarray | None:
         """The view [R, C, 1] in a message; None if it shows nothing."""
@@ -562,8 +504,11 @@ ROLES: dict[str, tuple[str, ...]] = {
     "odometry": (*POSES, *TWISTS),
     "views": (SCAN, CLOUD, *IMAGES),
     "touch": TOUCHES,
+    "wrench": WRENCHES,
 }
 """Types of messages that a part can have."""
+SEEN = ("views", "touch", "wrench")
+"""Parts of which a session has one."""
 
 
 def chosen_topics(config: TopicsConfig, messages: Messages) -> dict[str, Topic]:
@@ -573,11 +518,10 @@ def chosen_topics(config: TopicsConfig, messages: Messages) -> dict[str, Topic]:
         InputError: a topic is missing or has another type, or the settings cannot be used live.
     """
     key = "recording.topics"
-    if config.odometry is None or (config.views is None) == (config.touch is None):
-        found = "no odometry" if config.odometry is None else "not one of views and touch"
-        raise InputError(
-            key, found, "odometry, and views or touch", "`python -m ratslam topics` proposes them"
-        )
+    if config.odometry is None or all(getattr(config, name) is None for name in SEEN):
+        found = "no odometry" if config.odometry is None else "none of views, touch and wrench"
+        expected = "odometry, and views, touch or wrench"
+        raise InputError(key, found, expected, "`python -m ratslam topics` proposes them")
     if config.odometry.tf is not None:
         found, expected = "odometry between frames of /tf", "a topic with odometry"
         raise InputError(f"{key}.odometry", found, expected, "record a bag, or publish Odometry messages")

@@ -24,8 +24,8 @@ from robot.live.polling import (
     check_mapper,
     session_fault,
 )
-from robot.live.topic_steps import LiveMessages, TopicSteps, chosen_topics
-from robot.live.topics_client import Channel, Notice, Received, TopicsClient, Wanted
+from robot.live.topic_steps import TopicSteps, chosen_topics
+from robot.live.topics_client import Channel, LiveMessages, Notice, Received, TopicsClient, Wanted
 from robot.live.zenoh_client import ZenohClient
 from robot.recordings.bags.bag import TRANSFORMS, Topic
 from robot.recordings.bags.transforms import STATIC
@@ -34,6 +34,7 @@ from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import SPOILT
 from robot.sources.input_files import missing_error
 from tactile.base.errors import InputError
+from tactile.pokes import DEFAULT_POKES, PokeConfig
 
 Tell = Callable[[float, np.ndarray | None], None]
 DISCOVERY = 5.0
@@ -74,7 +75,8 @@ class TopicsRig(PolledRig):
     """A running robot; a context manager.
 
     Args:
-        recording: assigns its topics. say: called with one sentence for whatever is doubtful.
+        recording: assigns its topics. say: called with one sentence for whatever is doubtful. pokes: of
+            another program.
 
     Attributes:
         client: the connection. steps: of the session. latencies: from the arrival of the message that
@@ -89,11 +91,12 @@ class TopicsRig(PolledRig):
         recording: RecordingConfig,
         stopped: Callable[[], bool],
         say: Callable[[str], None],
+        pokes: PokeConfig = DEFAULT_POKES,
     ) -> None:
         super().__init__(config, stopped)
         assert config.topics is not None
         assert recording.topics is not None
-        self.topics, self._recording = config.topics, recording
+        self.topics, self._recording, self._pokes = config.topics, recording, pokes
         self.messages = LiveMessages(self.topics.source, recording.topics, say)
         self._kinds: dict[str, str] = {}  # of the topics that are used or recorded
         self.client = open_client(self.topics.source, self._wanted)
@@ -143,7 +146,8 @@ class TopicsRig(PolledRig):
             time.sleep(TICK)
 
     def _new_steps(self) -> TopicSteps:
-        return TopicSteps(self._recording, self.messages, self.topics.max_wait, self._tell_event)
+        longest = self.topics.max_wait
+        return TopicSteps(self._recording, self.messages, longest, self._tell_event, self._pokes)
 
     def _tell_event(self, name: str, text: str) -> None:
         self.events.append(Event(self.now(), name, text))

@@ -11,28 +11,30 @@ from robot.sources.odometry import correct_odometry
 from robot.sources.source import SOURCES, Source, SourceEntry, Warn
 from tactile.base.errors import InputError
 from tactile.base.plugins import read_settings
+from tactile.pokes import DEFAULT_POKES, PokeConfig
 
 BAGS = (".bag", ".db3")
 FORMATS = (".mcap", ".npz", ".csv", *BAGS, *VIDEO_SUFFIXES)
 """Suffixes of the files that are read without a plug-in."""
 
 
-def open_recording(config: RecordingConfig, warn: Warn = None) -> Source:
+def open_recording(config: RecordingConfig, warn: Warn = None, pokes: PokeConfig = DEFAULT_POKES) -> Source:
     """Open a recording, in the format of its suffix, and check all of it. A folder, and every recording with
     `topics`, is a bag.
 
     Args:
-        warn: called with one sentence if only a part of the recording is readable.
+        warn: called with one sentence if only a part of the recording is readable. pokes: of another
+            program, whose wrench and pose a bag has.
 
     Raises:
         InputError: the file is missing, its format is unknown, or it has errors.
     """
     stretch = Stretch(getattr(config, "from"), config.to)
     judge = InputJudge(config.limits, config.odometry, warn, stretch)
-    return correct_odometry(_open(config, judge), config.odometry)
+    return correct_odometry(_open(config, judge, pokes), config.odometry)
 
 
-def _open(config: RecordingConfig, judge: InputJudge) -> Source:
+def _open(config: RecordingConfig, judge: InputJudge, pokes: PokeConfig) -> Source:
     """The recording as it is. Readers are imported when they are needed: some are slow to load."""
     file = config.file
     if file is None:
@@ -44,7 +46,7 @@ def _open(config: RecordingConfig, judge: InputJudge) -> Source:
     if whole or suffix in BAGS or (suffix == ".mcap" and is_foreign(file)):
         from robot.recordings.bags.bag_reader import read_bag
 
-        return read_bag(config, judge)
+        return read_bag(config, judge, pokes)
     if suffix == ".mcap":
         from robot.recordings.mcap_reader import Recording
 

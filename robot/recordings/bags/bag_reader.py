@@ -14,14 +14,18 @@ from robot.recordings.bags.bag import Bag, Series, as_series, bag_files
 from robot.recordings.bags.topics_config import OdometryTopic, TopicsConfig, TouchTopic, ViewsTopic
 from robot.recordings.bags.transforms import read_odometry, read_poses
 from robot.recordings.bags.views import IMAGES, KEY, read_image_views, read_range_views
-from robot.recordings.input_judge import InputJudge, MotionTrack, unit_cure
+from robot.recordings.bags.wrench_pokes import read_forces, read_rings
+from robot.recordings.input_judge import InputJudge, MotionTrack, limits_of, unit_cure
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.sanity_checks import SPOILT
 from robot.sources.in_memory import InMemorySource
 from robot.sources.input_files import digest_of, missing_error, raise_errors
 from robot.sources.odometry import from_poses
+from robot.sources.source import SourceInfo
 from tactile.base.errors import InputError
 from tactile.base.se2 import integrate
+from tactile.base.types import Observation
+from tactile.pokes import PokeConfig
 
 JOINTS = "sensor_msgs/msg/JointState"
 ARRAYS = ("std_msgs/msg/Float32MultiArray", "std_msgs/msg/Float64MultiArray")
@@ -158,11 +162,12 @@ NO_VIEWS = (3, 6, 1)  # shape of the masked views of a recording without any
 
 
 @np.errstate(all="ignore")  # what is no number, or far too large, is reported
-def read_bag(settings: RecordingConfig, judge: InputJudge) -> InMemorySource:
+def read_bag(settings: RecordingConfig, judge: InputJudge, pokes: PokeConfig) -> InMemorySource:
     """A bag as a `Source`: one sample for each odometry message, or for each view.
 
     Args:
-        judge: is told of every message that is left out, and judges the odometry.
+        judge: is told of every message that is left out, and judges the odometry. pokes: of another program,
+            for `topics.wrench`.
 
     Raises:
         InputError: the bag is damaged, topics are missing or of another type, or values are impossible.
@@ -171,8 +176,6 @@ def read_bag(settings: RecordingConfig, judge: InputJudge) -> InMemorySource:
     assert path is not None
     with Bag(path, judge.say, judge.stretch, config.clock) as bag:
         config = _with_preset(bag, config)
-        if config.views is not None and config.touch is not None:
-            raise InputError("recording.topics", "both views and touch", "one of them")
         if config.odometry is None and (settings.visual_odometry is None or config.views is None):
             expected = "topics: {odometry: TOPIC}, or images as views and visual_odometry"
             listed = ", ".join(f"{topic.name} ({topic.kind})" for topic in bag.topics.values())
@@ -182,23 +185,31 @@ def read_bag(settings: RecordingConfig, judge: InputJudge) -> InMemorySource:
     found = [*odometry.errors, *(views.errors if views else []), *(truth.errors if truth else [])]
     raise_errors(list(dict.fromkeys(found)))
     raise_errors(_judge(odometry, judge))
+    rings, info = list[Observation](), SourceInfo()
+    if views is not None and config.wrench is not None:
+        views, rings = read_rings(bag, odometry, views, config.wrench, pokes)
+        info = SourceInfo(pokes=pokes)
     if views is not None and config.samples == "views":
         odometry, views = _sample_views(bag, odometry, views)
     shape, whiskers = NO_VIEWS, 0
     if views is not None:
         shape = (*views.values.shape[1:3], 1)
-        whiskers = shape[0] * shape[1] if config.touch is not None else 0
+        whiskers = 0 if config.views is not None else shape[0] * shape[1]
     errors, time = list[InputError](), odometry.time
     rows = blank_rows(path, time, odometry.values, shape)
     if views is not None:
         part = config.views or config.touch
         errors += _place_views(bag, rows, views, part.tolerance if part else None)
+    if rings:
+        rows |= {name: np.array([getattr(ring, name) for ring in rings]) for name in ("contact", "point")}
     if truth is not None:
         rows["truth"], faults = interpolated_poses(time, truth.time, truth.values, "time", truth.where)
         errors += faults
-    source = InMemorySource(digest=digest_of(bag_files(path)), alive=np.ones(whiskers, bool), **rows)
+    alive = np.ones(whiskers, bool)
+    source = InMemorySource(digest=digest_of(bag_files(path)), alive=alive, info=info, **rows)
     # The odometry is judged: only the truth is compared.
-    return judged(source, errors, replace(judge, warn=None), str(path))
+    judge = replace(judge, warn=None, limits=limits_of(info.interval, judge.limits))
+    return judged(source, errors, judge, str(path))
 
 
 def _judge(odometry: Series, judge: InputJudge) -> list[InputError]:
@@ -226,13 +237,13 @@ def _with_preset(bag: Bag, config: TopicsConfig) -> TopicsConfig:
     found: dict[str, OdometryTopic | ViewsTopic] = {}
     if config.odometry is None and wheels in bag.topics:
         found["odometry"] = OdometryTopic(topic=wheels, use="twist")
-    if config.views is None and config.touch is None and images:
+    if config.views is None and config.touch is None and config.wrench is None and images:
         found["views"] = ViewsTopic(topic=images[0])
     return config.model_copy(update=found)
 
 
 def _read_steps(bag: Bag, config: TopicsConfig, settings: RecordingConfig) -> tuple[Series, Series | None]:
-    """The odometry, and the views or touch readings if there are any."""
+    """The odometry, and the views, touch readings or forces if there are any."""
     odometry = None if config.odometry is None else read_odometry(bag, config.odometry)
     if config.views is not None and (topic := bag.topic(config.views.topic, KEY)).kind in IMAGES:
         wanted = None if odometry is not None else settings.visual_odometry
@@ -245,6 +256,8 @@ def _read_steps(bag: Bag, config: TopicsConfig, settings: RecordingConfig) -> tu
         raise InputError("recording.visual_odometry", "views without images", "images, or topics.odometry")
     if config.views is not None:
         return odometry, read_range_views(bag, config.views, config.body or odometry.body)
+    if config.wrench is not None:
+        return odometry, read_forces(bag, config.wrench)
     return odometry, None if config.touch is None else _read_touch(bag, config.touch)
 
 

@@ -127,6 +127,16 @@ class TouchTopic(Topic):
         return self
 
 
+class WrenchTopic(Topic):
+    """Force at a tool that another program pokes with (`touch.pokes`), from WrenchStamped or Wrench messages;
+    their frame may be any. The odometry is the pose of the tool."""
+
+    topic: str
+    """The topic."""
+    yaw: float = 0.0
+    """Direction of the first poke in the frame of the tool, rad, counter-clockwise."""
+
+
 class TopicsConfig(Settings):
     """Topics of a bag."""
 
@@ -136,6 +146,8 @@ class TopicsConfig(Settings):
     """Views, if any."""
     touch: TouchTopic | None = None
     """Touch sensors, instead of views."""
+    wrench: WrenchTopic | None = None
+    """Force at a tool that another program pokes with, instead of views."""
     truth: PoseTopic | None = None
     """True poses, if known; interpolated to the samples."""
     openratslam: str | None = Field(default=None, min_length=1)
@@ -146,7 +158,16 @@ class TopicsConfig(Settings):
     without a header have the latter only."""
     samples: Literal["odometry", "views"] = "odometry"
     """What makes a sample: each odometry message, with the nearest view; or each view (or touch reading),
-    with the odometry interpolated to its time, for views faster than the odometry."""
+    with the odometry interpolated to its time, for views faster than the odometry, and for pokes."""
     body: str | None = None
     """Frame of the robot, in which sensors are mounted; null: the child frame of the odometry, else
     base_link or base_footprint."""
+
+    @model_validator(mode="after")
+    def _has_one_kind_of_views(self) -> TopicsConfig:
+        given = [name for name in ("views", "touch", "wrench") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"both {given[0]} and {given[1]}: give one of them")
+        if self.wrench is not None and self.samples != "views":
+            raise ValueError("a wrench makes a sample of each ring of pokes: give samples: views")
+        return self

@@ -1,0 +1,264 @@
+"""Pokes of another program, found in the pose of its tool and in the force at it, state by state.
+
+A poke is an excursion: from a home along a line to the place where the tool turns, and back. Those about one
+home are a ring and become one image (`tactile.pokes`). A contact is a rise of the force at the end of the way
+out. The threshold is learned from the ways before, which were free, for the tool went on. The size of the
+change counts and not its direction, so the frame of the wrench may be any.
+
+Places within half a depth bin of each other count as one: a home that is not met exactly, noise of the pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from robot.recordings.alignment import interpolated_poses, no_overlap_error
+from robot.recordings.bags.bag import Bag, Series, as_series
+from robot.recordings.bags.topics_config import WrenchTopic
+from robot.sources.in_memory import NO_ODOMETRY
+from tactile.base.errors import InputError
+from tactile.base.se2 import integrate, wrap
+from tactile.base.types import Observation
+from tactile.pokes import PokeConfig, force_rise, poke_observation
+
+WRENCHES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
+"""Types of messages with the force at a tool."""
+MOST = 1 << 16
+"""States of an excursion that are kept."""
+State = tuple[float, ...]  # time s, x m, y m, heading rad, force N (3)
+
+
+def force_of(content: Any, place: str) -> tuple[float, float, float]:
+    """The force in a message, N.
+
+    Raises:
+        InputError: a number is not finite.
+    """
+    force = getattr(content, "wrench", content).force
+    found = float(force.x), float(force.y), float(force.z)
+    if not all(map(math.isfinite, found)):
+        raise InputError(place, f"the force is {', '.join(map(str, found))}", "finite numbers")
+    return found
+
+
+def _away(one: State, other: State) -> float:
+    return math.hypot(one[1] - other[1], one[2] - other[2])
+
+
+def _turn(one: State, other: State) -> float:
+    return abs(float(wrap(one[3] - other[3])))
+
+
+class PokeReader:
+    """Finds rings of pokes.
+
+    Args:
+        config: of the pokes. topic: where the force is. say: is told what is doubtful, a sentence.
+
+    Attributes:
+        rings: found so far and not yet taken: times at their home, s, and observations without motion.
+        pokes, touched: numbers of pokes so far, and of those with a contact.
+    """
+
+    def __init__(self, config: PokeConfig, topic: WrenchTopic, say: Callable[[str], None]) -> None:
+        self._config, self._topic, self._say = config, topic, say
+        self._near = config.reach / config.bins / 2
+        self._beside = np.pi / config.directions  # half the angle between two directions, rad
+        self.rings = deque[tuple[float, Observation]]()
+        self.pokes = self.touched = self._off = 0
+        self._told = set[str]()
+        self._states = deque[State](maxlen=MOST)  # since the tool was at home
+        self._ring: dict[int, float | None] = {}  # depth of the contact by direction, None without one
+        self._centre: State = ()  # home of the ring
+        self._at: State = ()  # the state there, when its last poke began
+        self._free = np.zeros(3)  # number, sum and sum of squares of the rises of free ways
+
+    def interrupt(self) -> None:
+        """Says that it is not known how the tool moved meanwhile."""
+        self._states.clear()
+        self._ring.clear()
+
+    def add(self, state: State) -> None:
+        """Adds a state: its time (s), pose (m, m, rad) and force (N, three numbers)."""
+        if not self._states:
+            self._begin([state])
+            return
+        self._states.append(state)
+        if self._back is None:
+            self._go_out(state)
+        else:
+            self._come_back(state, self._back)
+
+    def finish(self) -> None:
+        """Ends the last ring."""
+        self._end_ring()
+
+    def _begin(self, states: list[State], home: State | None = None) -> None:
+        """The tool is at a home in the first of these states, and moves through the others."""
+        self._states = deque(states[:1], maxlen=MOST)
+        self._home = self._far = home or states[0]
+        self._rest = self._left = states[0]  # the state nearest to the home in this stay, and when it ended
+        self._back: State | None = None  # on the way back: the state farthest from where the tool turned
+        for state in states[1:]:
+            self.add(state)
+
+    def _go_out(self, state: State) -> None:
+        config, near = self._config, self._near
+        way, farthest = _away(state, self._home), _away(self._far, self._home)
+        if way <= near and farthest <= near:
+            if _turn(state, self._rest) > self._beside / 8 or way < _away(self._rest, self._home):
+                self._rest = state
+            while self._states[0][0] < state[0] - config.before[1] - config.recent:
+                self._states.popleft()
+        if way > farthest:
+            self._far = state
+            if farthest <= near < way:
+                self._left = self._rest
+            if way > config.reach + near:  # no poke: a new home, later on this line, may be near its end
+                self._end_ring()
+                while _away(self._states[0], state) > config.reach + 2 * near:
+                    self._home = self._states.popleft()
+        elif farthest > near and _away(state, self._far) > near:
+            self._turn(state)
+
+    def _turn(self, state: State) -> None:
+        """The tool has turned at its farthest place; its way there began at the last corner."""
+        out = [each for each in self._states if each[0] <= self._far[0]]
+        away = self._aside(np.array(out).reshape(-1, len(state))[:, 1:3])
+        if away.max(initial=0.0) > self._near:
+            self._begin(self._since(out[int(away.argmax())]))
+        else:
+            self._back = state
+
+    def _since(self, state: State) -> list[State]:
+        return [each for each in self._states if each[0] >= state[0]]
+
+    def _aside(self, places: np.ndarray) -> np.ndarray:
+        """Distances [N] of places [N, 2] from the line between home and farthest place, m."""
+        start, end = np.array(self._home[1:3]), np.array(self._far[1:3])
+        along = (end - start) / np.linalg.norm(end - start)
+        return np.abs((places - start) @ np.array([-along[1], along[0]]))
+
+    def _come_back(self, state: State, back: State) -> None:
+        near, far = self._near, self._far
+        if _away(state, self._home) <= near:
+            self._poke(self._home, self._left)
+            self._begin([state], self._home)
+        elif _away(state, far) > _away(back, far):
+            self._back = state
+        elif _away(state, back) > near:  # it turns elsewhere: at a home on the way, or it has moved on
+            shorter = _away(back, far) < _away(self._home, far)
+            if shorter and self._aside(np.array([back[1:3]]))[0] <= near:
+                self._poke(back, back)
+                self._begin(self._since(back))
+            else:
+                self._begin(self._since(far))
+
+    def _poke(self, home: State, left: State) -> None:
+        """Adds the poke from a home to the farthest place to its ring; left: the state in which it began."""
+        config, length = self._config, _away(self._far, home)
+        if length <= self._near or _turn(self._states[-1], left) > self._beside / 4:  # it has moved on
+            return
+        if length > config.reach + self._near:
+            found = f"it comes back from {length:.3g} m away, beyond touch.pokes.reach, which is no poke"
+            self._tell("far", f"{found}; --set touch.pokes.reach={length:.2g} if it is one")
+            return
+        angle = math.atan2(self._far[2] - home[2], self._far[1] - home[1]) - left[3] - self._topic.yaw
+        row = round(float(wrap(angle)) / (2 * self._beside))
+        off = float(wrap(angle - 2 * self._beside * row))
+        if abs(off) > self._beside / 2:
+            self._off += 1
+            if self._off > max(config.directions, self.pokes):
+                found = f"most pokes are {np.degrees(off):.0f} degrees beside the directions of touch.pokes"
+                yaw = f"recording.topics.wrench.yaw={self._topic.yaw + off:.3f}"
+                self._tell("beside", f"{found} and left out; --set {yaw}, or touch.pokes.directions")
+            return
+        depth, row = self._felt(home, length), row % config.directions
+        self.pokes, self.touched = self.pokes + 1, self.touched + (depth is not None)
+        if depth is None and length < config.reach - self._near:  # it is not known why it ended
+            return
+        moved = self._ring and _away(home, self._centre) > 2 * self._near
+        if row in self._ring or moved or (self._ring and _turn(left, self._at) > self._beside / 2):
+            self._end_ring()
+        self._centre, self._at = home, left
+        self._ring[row] = depth
+        if len(self._ring) == config.directions:
+            self._end_ring()
+
+    def _felt(self, home: State, length: float) -> float | None:
+        """The depth of the contact in a poke of a length from a home, m; None without one."""
+        config, states, until = self._config, list(self._states), self._far[0] + self._config.recent
+        began = next((k for k, state in enumerate(states) if _away(state, home) <= self._near), 0)
+        part = np.array([state for state in states[began:] if state[0] <= until])
+        hz = (len(part) - 1) / (part[-1, 0] - part[0, 0])
+        if hz * config.recent < 0.9:
+            cure = f"publish it {1 / config.recent:.3g} times a second, or raise touch.pokes.recent"
+            self._tell("slow", f"the force comes {hz:.3g} times a second: short contacts are missed; {cure}")
+        depth = np.hypot(part[:, 1] - home[1], part[:, 2] - home[2])
+        rise = np.linalg.norm(force_rise(config, part[:, 4:].T, hz), axis=0)
+        last = depth >= length - self._near
+        free = rise[~last & (rise > 0)] if rise.any() else rise[~last]
+        self._free += len(free), free.sum(), (free**2).sum()
+        mean, square = self._free[1:] / max(self._free[0], 1.0)
+        felt = last & (rise > mean + config.sds * math.sqrt(max(square - mean**2, 0.0)))
+        return float(depth[felt.argmax()]) if felt.any() else None
+
+    def _end_ring(self) -> None:
+        config = self._config
+        depth = np.full(config.directions, config.reach)
+        contact = np.zeros(config.directions, bool)
+        for row, found in self._ring.items():
+            if found is not None:
+                depth[row], contact[row] = found, True
+        if self._ring:
+            self.rings.append((self._at[0], poke_observation(config, depth, contact, NO_ODOMETRY)))
+        self._ring.clear()
+
+    def _tell(self, what: str, sentence: str) -> None:
+        if what not in self._told:
+            self._say(f"{self._topic.topic}: {sentence}")
+        self._told.add(what)
+
+
+def read_forces(bag: Bag, config: WrenchTopic) -> Series:
+    """Forces [M, 3] of a topic, N."""
+    topic = bag.topic(config.topic, "recording.topics.wrench", WRENCHES)
+    rows = list(bag.stamped(topic, force_of))
+    numbers, stamps, forces = ([row[k] for row in rows] for k in range(3))
+    return as_series(bag, f"{bag.path}, {topic.name}", numbers, stamps, np.array(forces).reshape(-1, 3))
+
+
+def read_rings(
+    bag: Bag, odometry: Series, forces: Series, config: WrenchTopic, pokes: PokeConfig
+) -> tuple[Series, list[Observation]]:
+    """The rings of pokes of a tool: images [M, 1, D, 1] at the times at their home, and observations without
+    motion.
+
+    Raises:
+        InputError: there are none.
+    """
+    path = integrate(odometry.values[:, :3])
+    poses, _ = interpolated_poses(forces.time, odometry.time, path, "time", forces.where)
+    inside = np.isfinite(poses[:, 0])
+    if not inside.any():
+        raise no_overlap_error(forces.time, odometry.time, "time", forces.where)
+    reader = PokeReader(pokes, config, bag.warn)
+    for state in np.column_stack([forces.time, poses, forces.values])[inside].tolist():
+        reader.add(tuple(state))
+    reader.finish()
+    if not reader.rings:
+        found = f"no pokes in {int(inside.sum())} messages beside {odometry.where}"
+        expected = f"a tool that moves out along a line, at most {pokes.reach:g} m, and back to where it was"
+        raise InputError(forces.where, found, expected, "see touch.pokes.reach and the topic of the pose")
+    if not reader.touched:
+        found = f"none of {reader.pokes} pokes touched anything"
+        bag.warn(f"{forces.where}: {found}: is this the force at the tool, and is its pose the odometry?")
+    times, rings = zip(*reader.rings, strict=True)
+    numbers = forces.numbers[np.searchsorted(forces.time, times)]
+    images = np.array([ring.view for ring in rings])
+    return forces._replace(time=np.array(times), values=images, numbers=numbers), list(rings)
