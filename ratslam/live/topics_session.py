@@ -50,7 +50,11 @@ class TopicsSession(LiveRobot):
         assert config.live is not None
         assert config.recording is not None
         self._config, self._directory = config, directory
-        self.rig = TopicsRig(config.live, config.recording, stopped, lambda text: tell(f"warning: {text}"))
+        pokes = config.touch.pokes
+        self.rig = TopicsRig(
+            config.live, config.recording, stopped, lambda text: tell(f"warning: {text}"), pokes
+        )
+        self._pokes = pokes if self.rig.steps.feels else None
         self.total = None
 
     def find(self) -> Iterator[str]:
@@ -64,7 +68,9 @@ class TopicsSession(LiveRobot):
         assert self._config.live is not None
         origin = {"live": self._config.live.model_dump(mode="json", include={"topics"})}
         origin |= {} if self.rig.steps.whiskers else {"views": views_of(self._config)[1]}
-        source = SourceDescription(shape, self.rig.steps.whiskers, 0.0, SourceInfo(provenance=origin))
+        source = SourceDescription(
+            shape, self.rig.steps.whiskers, 0.0, SourceInfo(provenance=origin, pokes=self._pokes)
+        )
         extent = 10.0 if self._config.grid.side is None else self._config.grid.side / 2
         mapped = mapped_config(self._config, self._directory, RESERVED)
         draws = self.rig.topics.publish

@@ -144,7 +144,7 @@ def _describe_bag(path: Path) -> _Found:
     topics = suggested_topics(found)
     if not topics:
         faults.append("no topic can serve as odometry: Odometry, TwistStamped, PoseStamped, tf, or images")
-    sees = {"views", "touch"} & topics.keys()
+    sees = {"views", "touch", "wrench"} & topics.keys()
     for topic in found.topics:
         if topic.fault:
             (notes if sees or topic.kind not in VIEWS else faults).append(topic.fault)
@@ -153,7 +153,7 @@ def _describe_bag(path: Path) -> _Found:
     notes += [
         f"missing: {name}"
         for name in ("views", "truth")
-        if name not in topics and not (name == "views" and "touch" in topics)
+        if name not in topics and not (name == "views" and sees)
     ]
     start = min(topic.received.first for topic in found.topics)
     end = max(topic.received.last for topic in found.topics)

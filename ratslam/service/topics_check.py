@@ -10,13 +10,14 @@ from typing import Any
 from mcap.writer import Writer
 
 from ratslam.service.recording_check import Diagnosis, diagnose_recording
-from robot.live.topic_steps import ROLES, LiveMessages
-from robot.live.topics_client import Channel, Received, TopicsClient
+from robot.live.topic_steps import ROLES, SEEN
+from robot.live.topics_client import Channel, LiveMessages, Received, TopicsClient
 from robot.live.topics_rig import open_client
 from robot.recordings.bags.bag import TRANSFORMS
 from robot.recordings.bags.bag_description import BagDescription, TopicDescription, describe_bag
 from robot.recordings.bags.topics_config import TopicsConfig
 from robot.recordings.bags.views import CLOUD, LONGEST, SCAN
+from robot.recordings.bags.wrench_pokes import NO_RINGS
 from robot.recordings.mcap_writer import MessageWriter
 from tactile.base.errors import InputError
 
@@ -100,8 +101,10 @@ def _of_robot(
     described = {} if found is None else {topic.name: topic for topic in found.topics}
     rows: list[tuple[str, ...]] = [("topic", "type", "Hz", "age", "holds", "serves as")]
     rows += [_row(channel, described.get(channel.topic)) for _, channel in sorted(client.channels.items())]
-    faults = tuple(fault.replace(folder, "") for fault in heard.faults)
+    faults = tuple(fault.replace(folder, "") for fault in heard.faults if NO_RINGS not in fault)
     notes = tuple(note for note in heard.notes if folder not in note)
+    if len(faults) < len(heard.faults):
+        notes = (*notes, f"{NO_RINGS} within {seconds:g} s: `--seconds` listens longer")
     for topic in described.values():
         if topic.stamped is not None and abs(topic.stamped.ahead) > CLOCKS_DIFFER:
             said = f"{topic.name}: the clock of the robot is {topic.stamped.ahead:+.3g} s off this machine's"
@@ -115,10 +118,11 @@ def _of_robot(
     if "topic" not in (wheels := _part(topics.get("odometry"))):
         return Diagnosis(what, tuple(rows), notes, (NO_ODOMETRY,))
     topics["samples"] = "views"
-    sees = next((key for key in ("views", "touch") if key in topics), None)
+    sees = next((key for key in SEEN if key in topics), None)
     if sees is None:
-        return Diagnosis(what, tuple(rows), notes, ("no topic of views or touch",))
-    topics[sees] = _with_values(_part(topics[sees]), described, wheels["topic"])
+        return Diagnosis(what, tuple(rows), notes, ("no topic of views, touch or a wrench",))
+    if sees != "wrench":
+        topics[sees] = _with_values(_part(topics[sees]), described, wheels["topic"])
     recording["topics"] = topics
     sections = {"live": {"topics": {"source": address}}, "recording": recording, **config}
     return Diagnosis(what, tuple(rows), notes, faults, heard.advice, sections)

@@ -294,6 +294,11 @@ class TopicSteps:
         return (like.rows, like.columns, 1), 0
 
     @property
+    def feels(self) -> bool:
+        """Whether views are pokes of another program."""
+        return self._pokes is not None
+
+    @property
     def mounted(self) -> bool:
         """Whether the first view was seen, for whose sensor the transforms are."""
         return self._reader is not None or self._pokes is not None

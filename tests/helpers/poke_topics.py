@@ -11,41 +11,46 @@ from tests.helpers.ros_bags import Entry, header
 
 START = 1_700_000_000_123_456_789  # ns
 PRESS, DWELL = 10.0, 0.3  # the other program stops at this force, N, and rests so long, s
+RETRACT = 0.1  # speed of the way back and of the way on, m/s
 
 
-def profile(points, hz: float, speeds) -> np.ndarray:
-    """Positions [T] at a rate on the way through points, m, each leg at its speed; a speed of 0 is a rest."""
-    parts = [np.full(1, points[0])]
-    for (start, end), speed in zip(np.lib.stride_tricks.sliding_window_view(points, 2), speeds, strict=True):
-        count = round(DWELL * hz) if speed == 0 else int(np.ceil(abs(end - start) / speed * hz))
-        parts.append(start + (end - start) * np.arange(1, count + 1) / max(count, 1))
-    return np.concatenate(parts)
+def profile(turn: float, hz: float, out: float, rests: bool) -> np.ndarray:
+    """Depths [T] of a tool at a rate on its way out at a speed (m/s), up to `turn`, and back, m."""
+    ahead, back = (np.arange(int(turn / speed * hz) + 1) * speed / hz for speed in (out, RETRACT))
+    rest = np.zeros(round(DWELL * hz) if rests else 0)
+    return np.concatenate([rest, ahead, turn + rest, np.full(1, turn), turn - back, np.zeros(1)])
 
 
 def poked_states(
-    simulation: PokeSimulation, hz: float = 100.0, retract: float = 0.1, seed: int = 0, rests: bool = True
+    simulation: PokeSimulation,
+    hz: float = 100.0,
+    rings: int | None = None,
+    rests: bool = True,
+    skip: frozenset[tuple[int, int]] = frozenset(),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses [T, 3] of the tool in the frame of the odometry, true ones [T, 3], and forces [T, 3] in the frame
     of the tool, N.
 
     Args:
-        rests: whether the tool rests at home and where it turns.
+        rings: how many of the session, None for all. rests: whether the tool rests at home and where it
+            turns. skip: rings and directions in which it does not poke.
     """
-    pokes, force, random = simulation.pokes, simulation.config.force, np.random.default_rng(seed)
+    pokes, force, random = simulation.pokes, simulation.config.force, np.random.default_rng(0)
     homes, poses, true, ways = integrate(simulation.odometry[:, :3]), [], [], []
-    for home, place, way in zip(homes, simulation.truth, simulation.way, strict=True):
+    for number, (home, place, way) in enumerate(
+        list(zip(homes, simulation.truth, simulation.way, strict=True))[:rings]
+    ):
         if poses:  # moves on
-            steps = max(round(0.06 / retract * hz), 2)
+            steps = round(0.06 / RETRACT * hz)
             share, frames = np.linspace(0, 1, steps)[1:, None], ((poses, home), (true, place))
             for taken, end in frames:
                 taken.append(compose(taken[-1][-1], share * between(taken[-1][-1], end)))
             ways.append(np.zeros(steps - 1))
-        for angle, far in zip(poke_angles(pokes), way, strict=True):
+        for direction, (angle, far) in enumerate(zip(poke_angles(pokes), way, strict=True)):
+            if (number, direction) in skip:
+                continue
             turn = min(far + PRESS / force.stiffness, pokes.reach)
-            stay = [0.0] if rests else [pokes.speed]
-            depth = profile([0.0, 0.0, turn, turn, 0.0], hz, [*stay, pokes.speed, *stay, retract])
-            if not rests:
-                depth = depth[1:]
+            depth = profile(turn, hz, pokes.speed, rests)
             out = depth[:, None] * np.array([np.cos(angle), np.sin(angle), 0.0])
             poses.append(compose(home, out))
             true.append(compose(place, out))
@@ -62,7 +67,7 @@ def poked_states(
 
 
 def poke_messages(pose: np.ndarray, felt: np.ndarray, hz: float = 100.0) -> list[Entry]:
-    """PoseStamped and WrenchStamped messages of poses [T, 3] and forces [T, 3], in the order of their stamps."""
+    """PoseStamped and WrenchStamped messages of poses [T, 3] and forces [T, 3], in order."""
     found = []
     for row, (at, push) in enumerate(zip(pose.tolist(), felt.tolist(), strict=True)):
         time, (x, y, yaw) = START + round(row * 1e9 / hz), at

@@ -28,12 +28,13 @@ from robot.recordings.bags.views import (
     scan_limits,
     wider_extent,
 )
+from robot.recordings.bags.wrench_pokes import WRENCHES, force_of
 from robot.recordings.input_judge import MotionTrack, typical_motion
 from robot.recordings.sanity_checks import SPOILT
 from robot.sources.odometry import from_poses, from_velocities
 from tactile.base.errors import InputError
 
-Role = Literal["odometry", "views", "touch", "truth"]
+Role = Literal["odometry", "views", "touch", "pokes (wrench)", "truth"]
 
 
 class Times(NamedTuple):
@@ -145,6 +146,7 @@ _ROLES: dict[str, tuple[Role, ...]] = {
     **dict.fromkeys(POSES, ("odometry", "truth")),  # also of types that have both
     **dict.fromkeys((SCAN, CLOUD, *IMAGES), ("views",)),
     **dict.fromkeys(TOUCHES, ("touch",)),
+    **dict.fromkeys(WRENCHES, ("pokes (wrench)",)),
 }
 """What messages of a type can serve as."""
 
@@ -208,6 +210,8 @@ def _summary_of(content: Any, kind: str, where: str) -> Any:
         return len(ranges), high, median, nothing.mean(), content.header.frame_id, own
     if kind == CLOUD:
         return cloud_points(content, where)
+    if kind in WRENCHES:
+        return force_of(content, where)
     if kind in IMAGES:
         grey = grey_image(content, kind, where)
         encoding = content.encoding if kind == RAW else content.format
@@ -249,6 +253,9 @@ def _shape_of(bag: Bag, kind: str, kept: list[Any], stamps: list[int]) -> Shape:
         return Shape(f"{len(kept[0])} points, median {reach:.2g} m away")
     if kind in IMAGES:
         return kept[0]
+    if kind in WRENCHES:
+        size = np.linalg.norm(np.array(kept) - np.median(kept, axis=0), axis=1)
+        return Shape(f"forces, usually {np.median(size):.3g} N from their median, at most {size.max():.3g} N")
     if kind in TOUCHES:
         numbers = np.concatenate([value for _, value in kept])
         low, high = (float(numbers.min()), float(numbers.max())) if len(numbers) else (np.nan, np.nan)
@@ -286,6 +293,7 @@ def suggested_topics(bag: BagDescription) -> dict[str, Any]:
         found["odometry"] = odometry
     elif views is None or views[0].kind not in IMAGES:
         return {}
+    wrench = _first(bag, "pokes (wrench)", bag.topics)
     seen = views[0] if views else None
     if views is not None:
         found["views"] = views[1]
@@ -294,6 +302,8 @@ def suggested_topics(bag: BagDescription) -> dict[str, Any]:
         low, high = touch.shape.low, touch.shape.high
         if low < high and not (low >= 0 and high <= 1):
             found["touch"] = {"topic": touch.name, "low": low, "high": high}
+    elif wrench is not None:
+        seen, found["wrench"], found["samples"] = wrench, wrench.name, "views"
     if truth is not None:
         found["truth"] = truth.name
     used = [topic for topic in (wheels, seen, truth) if topic is not None]

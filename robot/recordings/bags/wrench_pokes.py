@@ -28,6 +28,7 @@ from tactile.pokes import PokeConfig, force_rise, poke_observation
 
 WRENCHES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
 """Types of messages with the force at a tool."""
+NO_RINGS = "no ring of pokes"
 MOST = 1 << 16
 """States of an excursion that are kept."""
 State = tuple[float, ...]  # time s, x m, y m, heading rad, force N (3)
@@ -71,7 +72,7 @@ class PokeReader:
         self._beside = np.pi / config.directions  # half the angle between two directions, rad
         self.rings = deque[tuple[float, Observation]]()
         self.pokes = self.touched = self._off = 0
-        self._told = set[str]()
+        self._told, self._long = set[str](), list[float]()
         self._states = deque[State](maxlen=MOST)  # since the tool was at home
         self._ring: dict[int, float | None] = {}  # depth of the contact by direction, None without one
         self._centre: State = ()  # home of the ring
@@ -122,40 +123,41 @@ class PokeReader:
             if way > config.reach + near:  # no poke: a new home, later on this line, may be near its end
                 self._end_ring()
                 while _away(self._states[0], state) > config.reach + 2 * near:
-                    self._home = self._states.popleft()
+                    self._states.popleft()
         elif farthest > near and _away(state, self._far) > near:
             self._turn(state)
 
     def _turn(self, state: State) -> None:
         """The tool has turned at its farthest place; its way there began at the last corner."""
         out = [each for each in self._states if each[0] <= self._far[0]]
-        away = self._aside(np.array(out).reshape(-1, len(state))[:, 1:3])
-        if away.max(initial=0.0) > self._near:
-            self._begin(self._since(out[int(away.argmax())]))
+        corner = max(out, key=self._aside, default=state)
+        if self._aside(corner) > self._near:
+            self._begin(self._since(corner))
         else:
             self._back = state
 
     def _since(self, state: State) -> list[State]:
         return [each for each in self._states if each[0] >= state[0]]
 
-    def _aside(self, places: np.ndarray) -> np.ndarray:
-        """Distances [N] of places [N, 2] from the line between home and farthest place, m."""
-        start, end = np.array(self._home[1:3]), np.array(self._far[1:3])
-        along = (end - start) / np.linalg.norm(end - start)
-        return np.abs((places - start) @ np.array([-along[1], along[0]]))
+    def _aside(self, state: State) -> float:
+        """Distance of a place from the line between home and farthest place, m."""
+        (x, y), (u, v) = ((end[1] - self._home[1], end[2] - self._home[2]) for end in (self._far, state))
+        return abs(u * y - v * x) / math.hypot(x, y)
 
     def _come_back(self, state: State, back: State) -> None:
         near, far = self._near, self._far
+        aside = self._aside(state) > near
         if _away(state, self._home) <= near:
             self._poke(self._home, self._left)
             self._begin([state], self._home)
-        elif _away(state, far) > _away(back, far):
+        elif not aside and _away(state, far) > _away(back, far):
             self._back = state
-        elif _away(state, back) > near:  # it turns elsewhere: at a home on the way, or it has moved on
-            shorter = _away(back, far) < _away(self._home, far)
-            if shorter and self._aside(np.array([back[1:3]]))[0] <= near:
-                self._poke(back, back)
-                self._begin(self._since(back))
+        elif aside or _away(state, back) > near:  # it turns elsewhere: at a home on its way, or it moves on
+            corner = max(self._since(far), key=lambda each: _away(far, each) + _away(each, state))
+            shorter = _away(corner, far) < _away(self._home, far)
+            if shorter and self._aside(corner) <= near:
+                self._poke(corner, corner)
+                self._begin(self._since(corner))
             else:
                 self._begin(self._since(far))
 
@@ -165,8 +167,12 @@ class PokeReader:
         if length <= self._near or _turn(self._states[-1], left) > self._beside / 4:  # it has moved on
             return
         if length > config.reach + self._near:
-            found = f"it comes back from {length:.3g} m away, beyond touch.pokes.reach, which is no poke"
-            self._tell("far", f"{found}; --set touch.pokes.reach={length:.2g} if it is one")
+            self._long.append(length)
+            if len(self._long) > config.directions:
+                found = (
+                    f"{len(self._long)} times it came back from beyond touch.pokes.reach, which is no poke"
+                )
+                self._tell("far", f"{found}; if it is, --set touch.pokes.reach={np.median(self._long):.2g}")
             return
         angle = math.atan2(self._far[2] - home[2], self._far[1] - home[1]) - left[3] - self._topic.yaw
         row = round(float(wrap(angle)) / (2 * self._beside))
@@ -251,13 +257,13 @@ def read_rings(
     for state in np.column_stack([forces.time, poses, forces.values])[inside].tolist():
         reader.add(tuple(state))
     reader.finish()
+    count = f"{reader.pokes} pokes, of which {reader.touched} touched something"
     if not reader.rings:
-        found = f"no pokes in {int(inside.sum())} messages beside {odometry.where}"
         expected = f"a tool that moves out along a line, at most {pokes.reach:g} m, and back to where it was"
-        raise InputError(forces.where, found, expected, "see touch.pokes.reach and the topic of the pose")
+        cure = "see touch.pokes.reach, and the topics of the tool's pose and of the force at it"
+        raise InputError(forces.where, f"{NO_RINGS}: {count}", expected, cure)
     if not reader.touched:
-        found = f"none of {reader.pokes} pokes touched anything"
-        bag.warn(f"{forces.where}: {found}: is this the force at the tool, and is its pose the odometry?")
+        bag.warn(f"{forces.where}: {count}: is this the force at the tool, and is its pose the odometry?")
     times, rings = zip(*reader.rings, strict=True)
     numbers = forces.numbers[np.searchsorted(forces.time, times)]
     images = np.array([ring.view for ring in rings])
