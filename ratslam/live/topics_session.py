@@ -50,11 +50,8 @@ class TopicsSession(LiveRobot):
         assert config.live is not None
         assert config.recording is not None
         self._config, self._directory = config, directory
-        pokes = config.touch.pokes
-        self.rig = TopicsRig(
-            config.live, config.recording, stopped, lambda text: tell(f"warning: {text}"), pokes
-        )
-        self._pokes = pokes if self.rig.steps.feels else None
+        warn, pokes = lambda text: tell(f"warning: {text}"), config.touch.pokes
+        self.rig = TopicsRig(config.live, config.recording, stopped, warn, pokes)
         self.total = None
 
     def find(self) -> Iterator[str]:
@@ -68,9 +65,9 @@ class TopicsSession(LiveRobot):
         assert self._config.live is not None
         origin = {"live": self._config.live.model_dump(mode="json", include={"topics"})}
         origin |= {} if self.rig.steps.whiskers else {"views": views_of(self._config)[1]}
-        source = SourceDescription(
-            shape, self.rig.steps.whiskers, 0.0, SourceInfo(provenance=origin, pokes=self._pokes)
-        )
+        pokes = self.rig.steps.pokes
+        info = SourceInfo(provenance=origin, pokes=None if pokes is None else pokes.config)
+        source = SourceDescription(shape, self.rig.steps.whiskers, 0.0, info)
         extent = 10.0 if self._config.grid.side is None else self._config.grid.side / 2
         mapped = mapped_config(self._config, self._directory, RESERVED)
         draws = self.rig.topics.publish

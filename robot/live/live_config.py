@@ -72,7 +72,7 @@ class TopicsLiveConfig(Settings):
     minutes: PositiveFloat | None = None
     """Duration of the session; null: until Ctrl-C."""
     record: tuple[str, ...] = ()
-    """Topics that are recorded besides those that are used, such as a wrench."""
+    """Topics that are recorded besides those that are used, such as an IMU."""
     publish: bool = False
     """Whether pose, path and health of the map are published to the robot, once a second, under /ratslam;
     never a velocity."""

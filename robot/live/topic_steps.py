@@ -239,6 +239,7 @@ class TopicSteps:
 
     Attributes:
         topics: names of those that are used, besides transforms. odometry: name of its topic.
+        pokes: of another program, which make the views; else None.
         shape: (R, C, 1) of the views; None before the first touch reading, whose layout may say it.
         whiskers: number of touch sensors, 0 for other views. dropped: views so far, by cause.
     """
@@ -260,12 +261,11 @@ class TopicSteps:
         odometry = self._topics.odometry
         assert odometry is not None
         held = holds_velocities(odometry, self._chosen["odometry"].kind)
-        wrench, history = self._topics.wrench, HISTORY
-        self._pokes = None if wrench is None else PokeReader(pokes, wrench, messages.warn)
+        wrench = self._topics.wrench
+        self.pokes = None if wrench is None else PokeReader(pokes, wrench, messages.warn)
         self._forces = deque[tuple[float, int, tuple[float, float, float]]]()  # time, arrival, N
         self._piece = 0  # of the last force
-        if wrench is not None:  # its ring is known once the tool has left
-            history += ring_time(pokes)
+        history = HISTORY + (0.0 if wrench is None else ring_time(pokes))  # a ring is late by its last pokes
         self.track = OdometryTrack(held, odometry.every, config.limits, history)
         self._body: str | None = None  # of the first odometry message
         self._early = deque[tuple[int, int, Any, str]](maxlen=WAITING)  # views before it
@@ -279,12 +279,12 @@ class TopicSteps:
         self._recent = deque[tuple[float, ...]](maxlen=JUDGED)  # time and value of odometry
         self._pieces = deque[bool](maxlen=JUDGED)  # whether each began a piece
         self.dropped = Counter[str]()
-        self.shape, self.whiskers = self._known_shape(pokes)
+        self.shape, self.whiskers = self._known_shape()
 
-    def _known_shape(self, pokes: PokeConfig) -> tuple[tuple[int, int, int] | None, int]:
+    def _known_shape(self) -> tuple[tuple[int, int, int] | None, int]:
         views, touch = self._topics.views, self._topics.touch
-        if self._pokes is not None:
-            return (1, pokes.directions, 1), pokes.directions
+        if self.pokes is not None:
+            return (1, self.pokes.config.directions, 1), self.pokes.config.directions
         if touch is not None:
             if touch.rows is None or touch.columns is None:
                 return None, 0
@@ -294,14 +294,9 @@ class TopicSteps:
         return (like.rows, like.columns, 1), 0
 
     @property
-    def feels(self) -> bool:
-        """Whether views are pokes of another program."""
-        return self._pokes is not None
-
-    @property
     def mounted(self) -> bool:
         """Whether the first view was seen, for whose sensor the transforms are."""
-        return self._reader is not None or self._pokes is not None
+        return self._reader is not None or self.pokes is not None
 
     def interrupt(self) -> None:
         """Says that the connection was lost: messages may be missing."""
@@ -323,7 +318,7 @@ class TopicSteps:
             self._add_odometry(topic, arrival, content, place)
         if topic == self._seen:
             stamp = messages.stamp(content, arrival)
-            if self._pokes is not None:
+            if self.pokes is not None:
                 force = force_of(content, place)
                 if self._in_order(topic, stamp, arrival):
                     self._forces.append((stamp / 10**9, arrival, force))
@@ -357,8 +352,7 @@ class TopicSteps:
 
     def _feel(self, now: int) -> None:
         """Passes on the forces for which the pose of the tool is known by now; its rings become views."""
-        pokes = self._pokes
-        while pokes is not None and self._forces:
+        while self.pokes is not None and self._forces:
             time, arrival, force = self._forces[0]
             if time > self.track.newest and now - arrival <= self._wait * 1e9:
                 return
@@ -370,10 +364,11 @@ class TopicSteps:
             pose, piece = found
             if piece != self._piece:
                 self._piece = piece
-                pokes.interrupt()
-            pokes.add((time, *pose.tolist(), *force))
-            while pokes.rings:
-                self._views.append(_View(pokes.rings[0][0], arrival, pokes.rings.popleft()[1]))
+                self.pokes.interrupt()
+            self.pokes.add((time, *pose.tolist(), *force))
+            while self.pokes.rings:
+                moment, reading = self.pokes.rings.popleft()
+                self._views.append(_View(moment, arrival, reading))
 
     def _sample(self, view: _View, pose: np.ndarray, piece: int) -> Begun:
         motion, begins, took = np.zeros(3), False, 0.0
@@ -512,8 +507,7 @@ ROLES: dict[str, tuple[str, ...]] = {
     "wrench": WRENCHES,
 }
 """Types of messages that a part can have."""
-SEEN = ("views", "touch", "wrench")
-"""Parts of which a session has one."""
+SEEN = ("views", "touch", "wrench")  # a session has one of them
 
 
 def chosen_topics(config: TopicsConfig, messages: Messages) -> dict[str, Topic]:

@@ -29,17 +29,12 @@ from tactile.pokes import PokeConfig, force_rise, poke_observation
 WRENCHES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
 """Types of messages with the force at a tool."""
 NO_RINGS = "no ring of pokes"
-MOST = 1 << 16
-"""States of an excursion that are kept."""
+MOST = 1 << 16  # states of an excursion that are kept
 State = tuple[float, ...]  # time s, x m, y m, heading rad, force N (3)
 
 
 def force_of(content: Any, place: str) -> tuple[float, float, float]:
-    """The force in a message, N.
-
-    Raises:
-        InputError: a number is not finite.
-    """
+    """The force in a message, N; an `InputError` if a number is not finite."""
     force = getattr(content, "wrench", content).force
     found = float(force.x), float(force.y), float(force.z)
     if not all(map(math.isfinite, found)):
@@ -51,7 +46,7 @@ def _away(one: State, other: State) -> float:
     return math.hypot(one[1] - other[1], one[2] - other[2])
 
 
-def _turn(one: State, other: State) -> float:
+def _turned(one: State, other: State) -> float:
     return abs(float(wrap(one[3] - other[3])))
 
 
@@ -59,24 +54,24 @@ class PokeReader:
     """Finds rings of pokes.
 
     Args:
-        config: of the pokes. topic: where the force is. say: is told what is doubtful, a sentence.
+        topic: where the force is. say: is told what is doubtful, a sentence.
 
     Attributes:
+        config: of the pokes.
         rings: found so far and not yet taken: times at their home, s, and observations without motion.
         pokes, touched: numbers of pokes so far, and of those with a contact.
     """
 
     def __init__(self, config: PokeConfig, topic: WrenchTopic, say: Callable[[str], None]) -> None:
-        self._config, self._topic, self._say = config, topic, say
+        self.config, self._topic, self._say = config, topic, say
         self._near = config.reach / config.bins / 2
-        self._beside = np.pi / config.directions  # half the angle between two directions, rad
+        self._angle = 2 * np.pi / config.directions  # between two directions, rad
         self.rings = deque[tuple[float, Observation]]()
-        self.pokes = self.touched = self._off = 0
-        self._told, self._long = set[str](), list[float]()
+        self.pokes = self.touched = self._between = 0
         self._states = deque[State](maxlen=MOST)  # since the tool was at home
         self._ring: dict[int, float | None] = {}  # depth of the contact by direction, None without one
         self._centre: State = ()  # home of the ring
-        self._at: State = ()  # the state there, when its last poke began
+        self._at: State = ()  # the state there when its last poke began
         self._free = np.zeros(3)  # number, sum and sum of squares of the rises of free ways
 
     def interrupt(self) -> None:
@@ -95,10 +90,6 @@ class PokeReader:
         else:
             self._come_back(state, self._back)
 
-    def finish(self) -> None:
-        """Ends the last ring."""
-        self._end_ring()
-
     def _begin(self, states: list[State], home: State | None = None) -> None:
         """The tool is at a home in the first of these states, and moves through the others."""
         self._states = deque(states[:1], maxlen=MOST)
@@ -109,10 +100,10 @@ class PokeReader:
             self.add(state)
 
     def _go_out(self, state: State) -> None:
-        config, near = self._config, self._near
+        config, near = self.config, self._near
         way, farthest = _away(state, self._home), _away(self._far, self._home)
         if way <= near and farthest <= near:
-            if _turn(state, self._rest) > self._beside / 8 or way < _away(self._rest, self._home):
+            if _turned(state, self._rest) > self._angle / 16 or way < _away(self._rest, self._home):
                 self._rest = state
             while self._states[0][0] < state[0] - config.before[1] - config.recent:
                 self._states.popleft()
@@ -120,9 +111,9 @@ class PokeReader:
             self._far = state
             if farthest <= near < way:
                 self._left = self._rest
-            if way > config.reach + near:  # no poke: a new home, later on this line, may be near its end
-                self._end_ring()
-                while _away(self._states[0], state) > config.reach + 2 * near:
+            if way > 2 * config.reach:  # no poke: a new home, later on this line, may be near its end
+                self.end_ring()
+                while _away(self._states[0], state) > 2 * config.reach:
                     self._states.popleft()
         elif farthest > near and _away(state, self._far) > near:
             self._turn(state)
@@ -163,72 +154,64 @@ class PokeReader:
 
     def _poke(self, home: State, left: State) -> None:
         """Adds the poke from a home to the farthest place to its ring; left: the state in which it began."""
-        config, length = self._config, _away(self._far, home)
-        if length <= self._near or _turn(self._states[-1], left) > self._beside / 4:  # it has moved on
-            return
-        if length > config.reach + self._near:
-            self._long.append(length)
-            if len(self._long) > config.directions:
-                found = (
-                    f"{len(self._long)} times it came back from beyond touch.pokes.reach, which is no poke"
-                )
-                self._tell("far", f"{found}; if it is, --set touch.pokes.reach={np.median(self._long):.2g}")
+        config, length = self.config, _away(self._far, home)
+        turned = _turned(self._states[-1], left) > self._angle / 8
+        if turned or not self._near < length < 2 * config.reach:  # it has moved on
             return
         angle = math.atan2(self._far[2] - home[2], self._far[1] - home[1]) - left[3] - self._topic.yaw
-        row = round(float(wrap(angle)) / (2 * self._beside))
-        off = float(wrap(angle - 2 * self._beside * row))
-        if abs(off) > self._beside / 2:
-            self._off += 1
-            if self._off > max(config.directions, self.pokes):
-                found = f"most pokes are {np.degrees(off):.0f} degrees beside the directions of touch.pokes"
+        row = round(float(wrap(angle)) / self._angle)
+        off = float(wrap(angle - self._angle * row))
+        if abs(off) > self._angle / 4:
+            self._between += 1
+            if self._between == config.directions > self.pokes:
+                found = (
+                    f"pokes {np.degrees(off):.0f} degrees beside the directions of touch.pokes are left out"
+                )
                 yaw = f"recording.topics.wrench.yaw={self._topic.yaw + off:.3f}"
-                self._tell("beside", f"{found} and left out; --set {yaw}, or touch.pokes.directions")
+                self._say(f"{self._topic.topic}: {found}; --set {yaw}, or touch.pokes.directions")
             return
         depth, row = self._felt(home, length), row % config.directions
         self.pokes, self.touched = self.pokes + 1, self.touched + (depth is not None)
         if depth is None and length < config.reach - self._near:  # it is not known why it ended
             return
-        moved = self._ring and _away(home, self._centre) > 2 * self._near
-        if row in self._ring or moved or (self._ring and _turn(left, self._at) > self._beside / 2):
-            self._end_ring()
-        self._centre, self._at = home, left
-        self._ring[row] = depth
+        if self._ring and (
+            row in self._ring
+            or _away(home, self._centre) > 2 * self._near
+            or _turned(left, self._at) > self._angle / 4
+        ):
+            self.end_ring()
+        self._centre, self._at, self._ring[row] = home, left, depth
         if len(self._ring) == config.directions:
-            self._end_ring()
+            self.end_ring()
 
     def _felt(self, home: State, length: float) -> float | None:
         """The depth of the contact in a poke of a length from a home, m; None without one."""
-        config, states, until = self._config, list(self._states), self._far[0] + self._config.recent
+        config, states, until = self.config, list(self._states), self._far[0] + self.config.recent
         began = next((k for k, state in enumerate(states) if _away(state, home) <= self._near), 0)
         part = np.array([state for state in states[began:] if state[0] <= until])
         hz = (len(part) - 1) / (part[-1, 0] - part[0, 0])
-        if hz * config.recent < 0.9:
-            cure = f"publish it {1 / config.recent:.3g} times a second, or raise touch.pokes.recent"
-            self._tell("slow", f"the force comes {hz:.3g} times a second: short contacts are missed; {cure}")
+        if hz * config.recent < 0.9 and not self.pokes:
+            found = f"the force comes {hz:.3g} times a second, and short contacts are missed"
+            cure = f"publish it {1 / config.recent:.3g} times, or raise touch.pokes.recent"
+            self._say(f"{self._topic.topic}: {found}; {cure}")
         depth = np.hypot(part[:, 1] - home[1], part[:, 2] - home[2])
         rise = np.linalg.norm(force_rise(config, part[:, 4:].T, hz), axis=0)
         last = depth >= length - self._near
         free = rise[~last & (rise > 0)] if rise.any() else rise[~last]
         self._free += len(free), free.sum(), (free**2).sum()
         mean, square = self._free[1:] / max(self._free[0], 1.0)
-        felt = last & (rise > mean + config.sds * math.sqrt(max(square - mean**2, 0.0)))
+        high = rise > mean + config.sds * math.sqrt(max(square - mean**2, 0.0))
+        felt = last & high & (depth < config.reach + self._near)
         return float(depth[felt.argmax()]) if felt.any() else None
 
-    def _end_ring(self) -> None:
-        config = self._config
-        depth = np.full(config.directions, config.reach)
-        contact = np.zeros(config.directions, bool)
-        for row, found in self._ring.items():
-            if found is not None:
-                depth[row], contact[row] = found, True
+    def end_ring(self) -> None:
+        """Ends the ring, if it has a poke."""
         if self._ring:
+            config, found = self.config, [self._ring.get(k) for k in range(self.config.directions)]
+            depth = np.array([config.reach if each is None else each for each in found])
+            contact = np.array([each is not None for each in found])
             self.rings.append((self._at[0], poke_observation(config, depth, contact, NO_ODOMETRY)))
         self._ring.clear()
-
-    def _tell(self, what: str, sentence: str) -> None:
-        if what not in self._told:
-            self._say(f"{self._topic.topic}: {sentence}")
-        self._told.add(what)
 
 
 def read_forces(bag: Bag, config: WrenchTopic) -> Series:
@@ -243,11 +226,7 @@ def read_rings(
     bag: Bag, odometry: Series, forces: Series, config: WrenchTopic, pokes: PokeConfig
 ) -> tuple[Series, list[Observation]]:
     """The rings of pokes of a tool: images [M, 1, D, 1] at the times at their home, and observations without
-    motion.
-
-    Raises:
-        InputError: there are none.
-    """
+    motion; an `InputError` if there are none."""
     path = integrate(odometry.values[:, :3])
     poses, _ = interpolated_poses(forces.time, odometry.time, path, "time", forces.where)
     inside = np.isfinite(poses[:, 0])
@@ -256,15 +235,15 @@ def read_rings(
     reader = PokeReader(pokes, config, bag.warn)
     for state in np.column_stack([forces.time, poses, forces.values])[inside].tolist():
         reader.add(tuple(state))
-    reader.finish()
+    reader.end_ring()
     count = f"{reader.pokes} pokes, of which {reader.touched} touched something"
     if not reader.rings:
-        expected = f"a tool that moves out along a line, at most {pokes.reach:g} m, and back to where it was"
-        cure = "see touch.pokes.reach, and the topics of the tool's pose and of the force at it"
-        raise InputError(forces.where, f"{NO_RINGS}: {count}", expected, cure)
+        expected = f"a tool that moves out along a line, {pokes.reach:g} m or up to a wall, and back"
+        raise InputError(
+            forces.where, f"{NO_RINGS}: {count}", expected, "see touch.pokes.reach and the topics"
+        )
     if not reader.touched:
         bag.warn(f"{forces.where}: {count}: is this the force at the tool, and is its pose the odometry?")
     times, rings = zip(*reader.rings, strict=True)
-    numbers = forces.numbers[np.searchsorted(forces.time, times)]
-    images = np.array([ring.view for ring in rings])
-    return forces._replace(time=np.array(times), values=images, numbers=numbers), list(rings)
+    values, numbers = np.array([ring.view for ring in rings]), np.arange(len(rings))
+    return forces._replace(time=np.array(times), values=values, numbers=numbers), list(rings)

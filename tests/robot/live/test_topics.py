@@ -15,7 +15,8 @@ from robot.live import topics_rig
 from robot.live.live_config import LiveConfig, TopicsLiveConfig
 from robot.live.polling import OperatorStop, SessionFault
 from robot.live.recorder import LiveRecorder
-from robot.live.topic_steps import LiveMessages, TopicSteps
+from robot.live.topic_steps import TopicSteps
+from robot.live.topics_client import LiveMessages
 from robot.live.topics_rig import TopicsRig, run_topics_loop
 from robot.recordings.bags.bag import Topic
 from robot.recordings.cdr import doubts_of
@@ -23,7 +24,11 @@ from robot.recordings.formats import open_recording
 from robot.recordings.mcap_reader import Recording
 from robot.recordings.mcap_writer import Recorder
 from robot.recordings.recording_config import RecordingConfig
-from robot.sources.source import SourceDescription
+from robot.simulation.head.simulated_pokes import PokeSimulation
+from robot.simulation.head.simulated_session import SimulationConfig
+from robot.sources.source import SourceDescription, SourceInfo
+from tactile.pokes import PokeConfig
+from tests.helpers.poke_topics import poke_messages, poked_states
 from tests.helpers.ros_bags import (
     ROS2,
     Entry,
@@ -49,7 +54,7 @@ def recording(**topics):
     found = {
         "odometry": "/odom",
         "samples": "views",
-        **(topics if "views" in topics or "touch" in topics else SCANS),
+        **(topics if {"views", "touch", "wrench"} & topics.keys() else SCANS),
     }
     return RecordingConfig.model_validate({"topics": found | topics})
 
@@ -70,11 +75,11 @@ def drive(seconds: float, seed: int = 0, period: int = 20_000_000, every: int = 
     return sorted(found, key=lambda entry: entry.time)
 
 
-def samples_of(config: RecordingConfig, entries: list[Entry]) -> list:
+def samples_of(config: RecordingConfig, entries: list[Entry], *pokes: PokeConfig) -> list:
     """The samples that come out of messages, each added as it arrives."""
     messages = LiveMessages("ws://nowhere", config.topics, lambda sentence: None)
     messages.topics = {entry.topic: Topic(entry.topic, entry.kind, 1) for entry in entries}
-    steps, found = TopicSteps(config, messages, 1e6, lambda name, text: None), []
+    steps, found = TopicSteps(config, messages, 1e6, lambda name, text: None, *pokes), []
     for entry in entries:
         content = built(ROS2, entry.kind, entry.fields)
         if entry.topic.startswith("/tf"):
@@ -91,6 +96,8 @@ def bits(samples) -> list:
         (
             sample.time,
             *map(float, sample.reading.odometry),
+            sample.reading.contact.tobytes(),
+            sample.reading.point.tobytes(),
             sample.reading.view.tobytes(),
             sample.reading.view.shape,
         )
@@ -167,6 +174,29 @@ def test_images_and_touch_become_views_as_in_a_bag(tmp_path):
         found = bits(samples_of(config, entries))
         assert found == bits(open_recording(config.model_copy(update={"file": path})))[: len(found)]
         assert len(found) > 15
+
+
+POKES = PokeConfig(directions=4, reach=0.12, speed=0.05)
+
+
+def poked(rings: int) -> tuple[RecordingConfig, list[Entry]]:
+    """Topics of an arm that another program moves."""
+    simulation = SimulationConfig(touch="force", path={"circuits": "C"}, seed=5)
+    pose, _, felt = poked_states(PokeSimulation(simulation, POKES), rings=rings)
+    return recording(odometry="/tool_pose", wrench="/ft"), poke_messages(pose, felt)
+
+
+def test_pokes_of_another_program_are_those_of_its_bag_to_the_bit(tmp_path):
+    config, entries = poked(8)
+    path = write_bag(tmp_path, "mcap", entries)
+    expected = bits(open_recording(config.model_copy(update={"file": path}), None, POKES))
+    assert len(expected) == 8
+    assert bits(samples_of(config, entries, POKES)) == expected
+    random = np.random.default_rng(0)  # messages of the two topics arrive at different times
+    delay = {"/ft": 0.3, "/tool_pose": 0.0}
+    arrival = [entry.time + 1e9 * delay[entry.topic] + random.integers(100) for entry in entries]
+    moved = [entries[number] for number in np.argsort(arrival, kind="stable")]
+    assert bits(samples_of(config, moved, POKES)) == expected
 
 
 def events_of(entries: list[Entry], **topics) -> tuple[list[str], list]:
@@ -295,11 +325,15 @@ def configured(address: str, **settings) -> LiveConfig:
 class Session:
     """A session in a thread's place: the rig is driven by the test until enough samples have come."""
 
-    def __init__(self, address: str, path=None, config: RecordingConfig | None = None, **settings) -> None:
+    def __init__(
+        self, address: str, path=None, config: RecordingConfig | None = None, pokes=None, **settings
+    ) -> None:
         self.mapper, self.told, self._stop = Listening(), [], False
         config = config or recording()
-        self.rig = TopicsRig(configured(address, **settings), config, lambda: self._stop, self.told.append)
-        shape = SourceDescription((3, 6, 1), 0, 0.0)
+        live, say = configured(address, **settings), self.told.append
+        self.rig = TopicsRig(live, config, lambda: self._stop, say, *([pokes] if pokes else []))
+        steps = self.rig.steps
+        shape = SourceDescription(steps.shape or (3, 6, 1), steps.whiskers, 0.0, SourceInfo(pokes=pokes))
         self.recorder = None if path is None else LiveRecorder(Recorder(path, shape))
 
     def run(self, act: Callable[[int], bool]) -> None:
@@ -372,6 +406,26 @@ def test_a_session_records_every_message_and_the_samples_that_were_mapped(bridge
     again = open_recording(recording().model_copy(update={"file": tmp_path / "session.mcap"}))  # as any bag
     assert bits(again)[: len(mapped)] == bits(mapped)
     assert session.rig.messages.counts == {"/odom": 500, "/scan": sum(e.topic == "/scan" for e in entries)}
+
+
+def test_a_session_of_pokes_of_another_program_is_that_of_its_recording(loopback, tmp_path):
+    config, entries = poked(3)
+    robot = SdkBridge(loopback, {entry.topic: entry.kind for entry in entries})
+    path = tmp_path / "session.mcap"
+    try:
+        session = Session(robot.address, path, config, POKES, max_wait=30.0)
+        with session.rig:
+            wait(lambda: robot.heard(["/ft", "/tool_pose"]))
+            session.run(paced(robot, entries))
+    finally:
+        robot.close()
+    mapped, recorded = session.mapper.samples, Recording(path)
+    assert len(mapped) == 3
+    assert bits(mapped) == bits(recorded)
+    assert recorded.info.pokes == POKES
+    again = config.model_copy(update={"file": path})
+    assert bits(open_recording(again, None, POKES)) == bits(mapped)
+    assert any(sample.reading.contact.any() for sample in mapped)
 
 
 def test_channels_of_ros_1_are_recorded_as_those_of_ros_2(loopback, tmp_path):

@@ -1,6 +1,7 @@
 """Pokes of another program: rings found in the pose of its tool and the force at it."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def rings_of(pose, felt, pokes=POKES, hz=HZ, told=None, **topic):
     reader = PokeReader(pokes, WrenchTopic(topic="/ft", **topic), say)
     for state in np.column_stack([np.arange(len(pose)) / hz, pose, felt]).tolist():
         reader.add(tuple(state))
-    reader.finish()
+    reader.end_ring()
     return list(reader.rings), reader
 
 
@@ -104,6 +105,14 @@ def test_a_force_without_noise_is_felt():
     agree(views(rings), exact.way[:RINGS])
 
 
+def test_what_lies_beyond_reach_is_not_felt():
+    pose, _, felt = STATES
+    short = POKES.model_copy(update={"reach": 0.09})
+    rings, _ = rings_of(pose, felt, short)
+    assert len(rings) == RINGS
+    agree(views(rings), SIMULATION.way[:RINGS], short)
+
+
 def test_directions_without_a_poke_are_unknown_and_rings_without_any_are_no_views():
     skip = {(1, 2), (3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (4, 3)}
     whole = views(rings_of(*poked_states(SIMULATION, HZ, RINGS)[::2])[0])
@@ -125,6 +134,23 @@ def test_what_comes_later_changes_no_ring(count):
 
 STATES = poked_states(SIMULATION, HZ, RINGS)
 WHOLE = rings_of(STATES[0], STATES[2])[0]
+
+
+places = st.tuples(st.sampled_from([0.0, 0.03, 0.1, -0.1, 0.6]), st.floats(-0.2, 0.2))
+
+
+@given(st.lists(places, min_size=2, max_size=30), st.integers(1, 40), st.integers(0, 99))
+def test_any_motion_of_a_tool_gives_rings_of_its_own_time_or_none(way, states, seed):
+    share = np.linspace(0, 1, states, endpoint=False)[:, None]
+    legs = [np.array(a) + share * (np.array(b) - a) for a, b in pairwise(way)]
+    random = np.random.default_rng(seed)
+    place = np.concatenate(legs) + random.normal(0, 1e-3, (len(legs) * states, 2))
+    pose = np.column_stack([place, random.choice([0.0, 0.5], len(place))])
+    rings, reader = rings_of(pose, random.normal(0, 1, (len(place), 3)))
+    times = [time for time, _ in rings]
+    assert times == sorted(times)
+    assert all(0 <= time <= len(place) / HZ for time in times)
+    assert ((views(rings) >= 0) & (views(rings) <= 1)).all() if rings else reader.pokes >= 0
 
 
 @pytest.mark.parametrize("how", ["permuted", "later"])
@@ -171,7 +197,6 @@ def test_what_is_doubtful_about_pokes_is_told_with_its_cure(write):
     for changes, sentence in (
         ({"hz": 10.0}, "10 times a second"),
         ({"yaw": 0.6}, "wrench.yaw=-0.0"),
-        ({"pokes": POKES.model_copy(update={"reach": 0.09})}, "--set touch.pokes.reach=0.12"),
     ):
         told, every = [], 10 if "hz" in changes else 1
         rings_of(pose[::every], felt[::every], told=told, **changes)
