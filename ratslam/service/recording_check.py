@@ -258,7 +258,7 @@ def diagnose_recording(path: Path, like: SavedMap | None = None) -> Diagnosis:
             whiskers = source.whiskers
     except InputError as error:
         faults = (*faults, *str(error).splitlines())
-    if like is None and not whiskers:
+    if like is None and not whiskers and "wrench" not in recording.get("topics", ()):
         # A share of the sensor's range, else the motion between views.
         size = reach / CELLS_IN_RANGE if np.isfinite(reach) else step or DEFAULT_CELL
         sections["pose_cells"] = {"cells_xy": TORUS, "cell_size": float(f"{size:.2g}")}

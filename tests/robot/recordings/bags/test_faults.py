@@ -44,7 +44,6 @@ MISSING = {
     "views of another type": ({"views": "/lab"}, ["/lab: messages of type lab_msgs/msg/Custom", "LaserScan"]),
     "odometry of another type": ({"odometry": "/scan"}, ["/scan: messages of type", "nav_msgs/msg/Odometry"]),
     "touch of another type": ({"touch": "/scan"}, ["/scan: messages of type", "JointState"]),
-    "views and touch": ({"views": "/scan", "touch": "/scan"}, ["both views and touch"]),
     "odometry": ({"odometry": None}, ["no odometry", "/scan (sensor_msgs/msg/LaserScan)"]),
     "frame": ({"odometry": {"tf": ["odom", "base_link"]}}, ["/tf: no frame 'odom'"]),
     "preset": ({"openratslam": "irat", "odometry": None}, ["no topic '/irat/odom'"]),

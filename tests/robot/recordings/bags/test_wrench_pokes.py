@@ -216,7 +216,7 @@ def test_doctor_proposes_the_wrench_of_a_tool(write):
 
 @pytest.mark.soak
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("seed", [41, 42])
+@pytest.mark.parametrize("seed", [41, 42, 43])
 def test_the_map_is_as_good_as_that_of_our_own_session(seed):
     jitter = {"position": 0.005, "yaw_deg": 1.5, "speed": 0.05}
     settings = {"touch": "force", "path": {"circuits": "CACA"}, "motion": {"jitter": jitter}, "seed": seed}
