@@ -20,8 +20,7 @@ WAITING = 4096
 """Messages that may wait to be taken; then the client reads no further."""
 FULL = 0.01
 """Period at which room for more messages is looked for, s."""
-KEPT = 256
-"""Moving transforms of a topic that are kept, for the mount of a sensor."""
+KEPT = 256  # moving transforms of a topic that are kept, for the mount of a sensor
 MOST_TOPICS = 10_000
 """Topics of a robot of which more are ignored."""
 CONNECT_TIMEOUT = 5.0

@@ -46,10 +46,6 @@ def _away(one: State, other: State) -> float:
     return math.hypot(one[1] - other[1], one[2] - other[2])
 
 
-def _turned(one: State, other: State) -> float:
-    return abs(float(wrap(one[3] - other[3])))
-
-
 class PokeReader:
     """Finds rings of pokes.
 
@@ -103,7 +99,7 @@ class PokeReader:
         config, near = self.config, self._near
         way, farthest = _away(state, self._home), _away(self._far, self._home)
         if way <= near and farthest <= near:
-            if _turned(state, self._rest) > self._angle / 16 or way < _away(self._rest, self._home):
+            if abs(wrap(state[3] - self._rest[3])) > self._angle / 16 or way < _away(self._rest, self._home):
                 self._rest = state
             while self._states[0][0] < state[0] - config.before[1] - config.recent:
                 self._states.popleft()
@@ -155,7 +151,7 @@ class PokeReader:
     def _poke(self, home: State, left: State) -> None:
         """Adds the poke from a home to the farthest place to its ring; left: the state in which it began."""
         config, length = self.config, _away(self._far, home)
-        turned = _turned(self._states[-1], left) > self._angle / 8
+        turned = abs(wrap(self._states[-1][3] - left[3])) > self._angle / 8
         if turned or not self._near < length < 2 * config.reach:  # it has moved on
             return
         angle = math.atan2(self._far[2] - home[2], self._far[1] - home[1]) - left[3] - self._topic.yaw
@@ -177,7 +173,7 @@ class PokeReader:
         if self._ring and (
             row in self._ring
             or _away(home, self._centre) > 2 * self._near
-            or _turned(left, self._at) > self._angle / 4
+            or abs(wrap(left[3] - self._at[3])) > self._angle / 4
         ):
             self.end_ring()
         self._centre, self._at, self._ring[row] = home, left, depth

@@ -20,7 +20,12 @@ from rosbags.highlevel import AnyReader
 from evaluation.artifacts.run_reader import read_manifest
 from evaluation.metrics.trajectory import ate, interpolate, read_tum
 from ratslam.cli import main
+from ratslam.service.topics_check import diagnose_topics
+from robot.simulation.head.simulated_pokes import PokeSimulation
+from robot.simulation.head.simulated_session import SimulationConfig
+from tactile.pokes import PokeConfig
 from tests.helpers.commands import ROOT, refused, said, start
+from tests.helpers.poke_topics import poke_messages, poked_states
 from tests.helpers.ros_bags import ROS2, Entry, odometry, scan, write_bag
 from tests.helpers.stand_in_robot import PlainBridge, SdkBridge, ZenohRobot, in_cdr
 
@@ -485,3 +490,32 @@ def test_what_cannot_be_mapped_is_refused_before_a_session(loopback, tmp_path, c
         player.done.set()
     finally:
         robot.close()
+
+
+def test_the_wrench_of_a_tool_is_proposed_before_a_ring_is_whole(loopback):
+    simulation = PokeSimulation(SimulationConfig(touch="force", path={"circuits": "C"}), PokeConfig())
+    pose, _, felt = poked_states(simulation, rings=1)
+    entries = poke_messages(pose, felt)
+    robot = SdkBridge(loopback, {entry.topic: entry.kind for entry in entries})
+    over = threading.Event()
+
+    def talk():
+        for first in range(0, len(entries), 20):
+            if over.wait(0.1):
+                return
+            robot.send(*entries[first : first + 20])
+
+    talker = threading.Thread(target=talk)
+    talker.start()
+    try:
+        found = diagnose_topics(robot.address, 2.0)
+    finally:
+        over.set()
+        talker.join()
+        robot.close()
+    assert found.faults == ()
+    assert any("no ring of pokes within 2 s" in note for note in found.notes)
+    assert found.config["recording"]["topics"] == {
+        "odometry": "/tool_pose", "wrench": "/ft", "samples": "views",
+    }  # fmt: skip
+    assert ("/ft", "pokes (wrench)") in [(row[0], row[-1]) for row in found.table]
