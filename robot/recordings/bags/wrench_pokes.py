@@ -79,11 +79,11 @@ class PokeReader:
         """Adds a state: its time (s), pose (m, m, rad) and force (N, three numbers)."""
         if not self._states:
             self._begin([state])
-            return
-        self._states.append(state)
-        if self._back is None:
+        elif self._back is None:
+            self._states.append(state)
             self._go_out(state)
         else:
+            self._states.append(state)
             self._come_back(state, self._back)
 
     def _begin(self, states: list[State], home: State | None = None) -> None:
@@ -170,11 +170,9 @@ class PokeReader:
         self.pokes, self.touched = self.pokes + 1, self.touched + (depth is not None)
         if depth is None and length < config.reach - self._near:  # it is not known why it ended
             return
-        if self._ring and (
-            row in self._ring
-            or _away(home, self._centre) > 2 * self._near
-            or abs(wrap(left[3] - self._at[3])) > self._angle / 4
-        ):
+        centre, at = (self._centre, self._at) if self._ring else (home, left)
+        moved = _away(home, centre) > 2 * self._near or abs(wrap(left[3] - at[3])) > self._angle / 4
+        if moved or row in self._ring:
             self.end_ring()
         self._centre, self._at, self._ring[row] = home, left, depth
         if len(self._ring) == config.directions:
