@@ -112,16 +112,13 @@ class PokeReader:
                 while _away(self._states[0], state) > 2 * config.reach:
                     self._states.popleft()
         elif farthest > near and _away(state, self._far) > near:
-            self._turn(state)
-
-    def _turn(self, state: State) -> None:
-        """The tool has turned at its farthest place; its way there began at the last corner."""
-        out = [each for each in self._states if each[0] <= self._far[0]]
-        corner = max(out, key=self._aside, default=state)
-        if self._aside(corner) > self._near:
-            self._begin(self._since(corner))
-        else:
-            self._back = state
+            # The tool has turned at its farthest place; its way there began at the last corner.
+            out = [each for each in self._states if each[0] <= self._far[0]]
+            corner = max(out, key=self._aside, default=state)
+            if self._aside(corner) > near:
+                self._begin(self._since(corner))
+            else:
+                self._back = state
 
     def _since(self, state: State) -> list[State]:
         return [each for each in self._states if each[0] >= state[0]]
