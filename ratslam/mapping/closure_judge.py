@@ -49,7 +49,7 @@ BEYOND = 80
 EXTENT = 50
 """Keyframes of the older pass before and after it, beyond those, that may be compared."""
 LEAST, MOST = -6.0, 8.0
-"""Limits of R; odometry has outliers."""
+"""Limits of R in L; odometry has outliers."""
 EDGES = np.array([-1.5, 0.0, 1.5])
 """Gains, nat, between views that contradict, disagree, agree and fit."""
 KINDS = len(EDGES) + 3
@@ -66,9 +66,9 @@ class SequenceEvidence(NamedTuple):
     """What is known of n sequences.
 
     Attributes:
-        odometry_ratio: [n] R; NaN where odometry is broken between the keyframes that a sequence joins,
-            about which nothing is said. counts: [n, 2, 2, KINDS] views of each kind: over the map and over
-            the older pass; of the sequence and around it.
+        odometry_ratio: [n] R, not limited below; NaN where odometry is broken between the keyframes that a
+            sequence joins, about which nothing is said. counts: [n, 2, 2, KINDS] views of each kind: over the
+            map and over the older pass; of the sequence and around it.
     """
 
     odometry_ratio: np.ndarray
@@ -76,7 +76,7 @@ class SequenceEvidence(NamedTuple):
 
     def features(self) -> np.ndarray:
         """[n, 2, 3 + 2 KINDS] factors of the weights, over the map and over the older pass."""
-        ratio, n = self.odometry_ratio, len(self.odometry_ratio)
+        ratio, n = np.maximum(self.odometry_ratio, LEAST), len(self.odometry_ratio)
         first = np.column_stack([np.ones(n), np.maximum(ratio, 0), np.minimum(ratio, 0)])
         counts = self.counts.reshape(n, 2, 2 * KINDS)
         return np.concatenate([np.repeat(first[:, None], 2, axis=1), counts], axis=2)
@@ -94,12 +94,18 @@ def shipped_weights() -> np.ndarray:
     return np.array(json.loads((files(__package__) / WEIGHTS).read_text(encoding="utf-8"))["weights"])
 
 
-def judge_sequences(state: MapState, sequences: np.ndarray) -> np.ndarray:
+def judge_sequences(state: MapState, sequences: np.ndarray, outliers: bool = True) -> np.ndarray:
     """[n] log-odds of sequences [n] of a map; NaN where nothing is said: of views without weights, and
-    where the robot may be carried, as odometry then gives no prior."""
+    where the robot may be carried, as odometry then gives no prior.
+
+    Args:
+        outliers: whether odometry may have them; else R below `LEAST` counts in full.
+    """
     if not state.appearance.JUDGED or state.config.may_be_carried:
         return np.full(len(sequences), np.nan)
-    return sequence_evidence(state, sequences, BEYOND).log_odds(shipped_weights())
+    evidence = sequence_evidence(state, sequences, BEYOND)
+    excluded = 0.0 if outliers else np.minimum(evidence.odometry_ratio - LEAST, 0.0)
+    return evidence.log_odds(shipped_weights()) + excluded
 
 
 def judge_anew(state: MapState, sequences: np.ndarray) -> None:
@@ -111,9 +117,13 @@ def judge_anew(state: MapState, sequences: np.ndarray) -> None:
 
 def doubt_of_closures(state: MapState) -> float:
     """Probability that the accepted sequences of a map are false if they are so together,
-    1 / (1 + exp(S)), with the sum S of L; NaN if nothing is said of any."""
+    1 / (1 + exp(S)), with the sum S of L without outliers; NaN if nothing is said of any.
+
+    Where a room looks alike after half a turn, every view on the way agrees with a false sequence, and only
+    odometry speaks against it: there with R of -10 to -90, where true sequences seldom have less than -6.
+    """
     accepted = np.flatnonzero((state.log.verdicts() == Verdict.ACCEPTED) & (state.log.left() > 0))
-    odds = judge_sequences(state, accepted)
+    odds = judge_sequences(state, accepted, outliers=False)
     return float(expit(-np.nansum(odds))) if np.isfinite(odds).any() else np.nan
 
 
@@ -142,7 +152,7 @@ def sequence_evidence(state: MapState, sequences: np.ndarray, after: int) -> Seq
         gate = (config.gate_sd * state.cell) ** 2, config.gate_heading**2
         apart = np.empty(max(j - state.guard, 1))
         ratio = log_ratio(x, y, heading, between, i, j, -turn, gate, apart)
-        found.odometry_ratio[k] = float(np.clip(ratio, LEAST, MOST))
+        found.odometry_ratio[k] = min(float(ratio), MOST)
         reach = EXTENT + way.last - way.first + BEYOND
         end = max(min(way.match + reach, way.middle - state.guard), way.match) + 1
         older = slice(max(way.match - reach, 0), end)

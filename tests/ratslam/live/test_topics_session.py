@@ -18,6 +18,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from evaluation.artifacts.run_reader import read_manifest
+from evaluation.metrics.trajectory import ate, interpolate, read_tum
 from ratslam.cli import main
 from ratslam.service.topics_check import diagnose_topics
 from robot.simulation.head.simulated_pokes import PokeSimulation
@@ -56,15 +57,19 @@ def ranges(pose, angles):
     return np.where((away > 0) & (along >= 0) & (along <= 1), away, 30.0).min(1)
 
 
-def rounds(count: float) -> list[Entry]:
-    """Messages of a robot that drives rectangles of 4 m x 3 m: drifting odometry at 50 Hz, scans at 10."""
+def rounds(count: float, drift: float = 0.02) -> list[Entry]:
+    """Messages of a robot that drives rectangles of 4 m x 3 m: odometry at 50 Hz, scans at 10.
+
+    Args:
+        drift: of the odometry, share of the distance and rad/m.
+    """
     sides = [4.0, 3.0] * 40
     pose, drifted, found, step = np.zeros(3), np.zeros(3), list[Entry](), 0
     for side in sides[: round(4 * count)]:
         for turn, steps in ((0.0, round(side / 0.4 * 50)), (np.pi / 2, round(np.pi / 2 / 0.7 * 50))):
             for _ in range(steps):
                 ahead = side / steps if not turn else 0.0
-                for each, scale, bias in ((pose, 1.0, 0.0), (drifted, 1.02, 0.02)):
+                for each, scale, bias in ((pose, 1.0, 0.0), (drifted, 1 + drift, drift)):
                     each += [scale * ahead * np.cos(each[2]), scale * ahead * np.sin(each[2]), 0.0]
                     each[2] += (turn / steps if turn else 0.0) + bias * ahead
                 at = START + step * 20_000_000
@@ -263,6 +268,12 @@ def test_a_create_3_is_mapped_by_what_it_touches(touch, loopback, tmp_path, caps
     maps_alike(tmp_path / "live", tmp_path / "again")
     bag = write_bag(tmp_path, "mcap", entries)
     maps_of_file(tmp_path / "live", config, bag, tmp_path / "file")
+    true = [entry for entry in rounds(1.3, drift=0.0) if entry.topic == "/odom"]
+    places = [entry.fields["pose"]["pose"]["position"] for entry in true]
+    path = np.array([(place["x"], place["y"], 0.0) for place in places])
+    mapped, wheels = (read_tum(tmp_path / "again" / name) for name in ("trajectory.tum", "odometry.tum"))
+    truth = interpolate(np.array([entry.time for entry in true]) / 1e9, path, mapped[0])
+    assert ate(mapped[1], truth) <= 1.05 * ate(wheels[1], truth)  # the room is alike after half a turn
 
 
 def configured(folder: Path, address: str) -> Path:
