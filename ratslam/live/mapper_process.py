@@ -35,7 +35,7 @@ LOG = "mapper.log"
 MOST_DRAWN = 1000
 """Poses of a drawn path, about."""
 FINISH_TIMEOUT = 120.0
-"""Time limit of scoring and plotting, s."""
+"""Time without a result after which the mapper is given up at the end; scoring and plotting give none, s."""
 
 
 class MappingJob(NamedTuple):
@@ -144,11 +144,15 @@ class Mapper(AbstractContextManager["Mapper"]):
         """Passes warnings about the input to the run."""
         self._outbox.put(sentences)
 
+    def waiting(self) -> int:
+        """Number of samples that are not mapped yet."""
+        self.receive()
+        return len(self._offered) - (self.mapped[-1].number + 1 if self.mapped else 0)
+
     def behind(self) -> float:
         """Waiting time of the oldest sample that is not mapped yet, s."""
-        self.receive()
-        done = self.mapped[-1].number + 1 if self.mapped else 0
-        return time.monotonic() - self._offered[done] if done < len(self._offered) else 0.0
+        waiting = self.waiting()
+        return time.monotonic() - self._offered[-waiting] if waiting else 0.0
 
     def receive(self) -> None:
         """Reads the messages of the process."""
@@ -179,16 +183,18 @@ class Mapper(AbstractContextManager["Mapper"]):
         return str(self._failed or f"it ended with code {self._process.exitcode}")
 
     def finish(self, interrupted: bool) -> Scorecard | None:
-        """Waits for the score; None if the process has ended or mapped nothing.
+        """Waits until the samples that wait are mapped and scored; None if the process has ended, mapped
+        nothing, or gives no result for `FINISH_TIMEOUT`.
 
         Args:
             interrupted: whether the session ended early.
         """
         self._outbox.put(interrupted)
-        due = time.monotonic() + FINISH_TIMEOUT
+        waiting, due = self.waiting(), time.monotonic() + FINISH_TIMEOUT
         while self._card is None and self.alive and time.monotonic() < due:
             self._line.poll(0.05)
-            self.receive()
+            if self.waiting() < waiting:
+                waiting, due = self.waiting(), time.monotonic() + FINISH_TIMEOUT
         return self._card
 
     def _send(self) -> None:

@@ -42,7 +42,8 @@ WALLS = np.array(
         (4.7, -0.3, 5.1, 0.4), (-1.1, 3.2, -0.6, 3.9), (0.4, 3.7, 1.3, 4.1),
     ]
 )  # fmt: skip
-PATIENCE = 120.0
+PATIENCE = 300.0  # beside busy programs a mapper, which stands back, gets a small share of the processors
+pytestmark = pytest.mark.timeout(900)
 SAME = ("trajectory.tum", "online.tum", "steps.csv", "closures.csv", "odometry.tum")
 
 
