@@ -50,6 +50,10 @@ EXTENT = 50
 """Keyframes of the older pass before and after it, beyond those, that may be compared."""
 LEAST, MOST = -6.0, 8.0
 """Limits of R in L; odometry has outliers."""
+FACTORS = np.exp(np.linspace(0.0, 3.0, 31))
+"""Factors by which the odometry may be noisier than set."""
+NOISIER = 0.35
+"""Standard deviation of their logarithm: half as noisy again is usual, twice as noisy happens."""
 EDGES = np.array([-1.5, 0.0, 1.5])
 """Gains, nat, between views that contradict, disagree, agree and fit."""
 KINDS = len(EDGES) + 3
@@ -94,18 +98,12 @@ def shipped_weights() -> np.ndarray:
     return np.array(json.loads((files(__package__) / WEIGHTS).read_text(encoding="utf-8"))["weights"])
 
 
-def judge_sequences(state: MapState, sequences: np.ndarray, outliers: bool = True) -> np.ndarray:
+def judge_sequences(state: MapState, sequences: np.ndarray) -> np.ndarray:
     """[n] log-odds of sequences [n] of a map; NaN where nothing is said: of views without weights, and
-    where the robot may be carried, as odometry then gives no prior.
-
-    Args:
-        outliers: whether odometry may have them; else R below `LEAST` counts in full.
-    """
+    where the robot may be carried, as odometry then gives no prior."""
     if not state.appearance.JUDGED or state.config.may_be_carried:
         return np.full(len(sequences), np.nan)
-    evidence = sequence_evidence(state, sequences, BEYOND)
-    excluded = 0.0 if outliers else np.minimum(evidence.odometry_ratio - LEAST, 0.0)
-    return evidence.log_odds(shipped_weights()) + excluded
+    return sequence_evidence(state, sequences, BEYOND).log_odds(shipped_weights())
 
 
 def judge_anew(state: MapState, sequences: np.ndarray) -> None:
@@ -117,14 +115,23 @@ def judge_anew(state: MapState, sequences: np.ndarray) -> None:
 
 def doubt_of_closures(state: MapState) -> float:
     """Probability that the accepted sequences of a map are false if they are so together,
-    1 / (1 + exp(S)), with the sum S of L without outliers; NaN if nothing is said of any.
+    1 / (1 + exp(S)), with the sum S of their log-odds, in which R below `LEAST` counts in full; NaN if
+    nothing is said of any.
 
     Where a room looks alike after half a turn, every view on the way agrees with a false sequence, and only
-    odometry speaks against it: there with R of -10 to -90, where true sequences seldom have less than -6.
+    odometry speaks against it. The odometry may be noisier than set, by a factor f with a prior of its own
+    (`NOISIER`): R is then about R / f^2, and S the sum with the likeliest factor.
     """
+    if not state.appearance.JUDGED or state.config.may_be_carried:
+        return np.nan
     accepted = np.flatnonzero((state.log.verdicts() == Verdict.ACCEPTED) & (state.log.left() > 0))
-    odds = judge_sequences(state, accepted, outliers=False)
-    return float(expit(-np.nansum(odds))) if np.isfinite(odds).any() else np.nan
+    evidence = sequence_evidence(state, accepted, BEYOND)
+    odds = evidence.log_odds(shipped_weights())
+    if not np.isfinite(odds).any():
+        return np.nan
+    excluded = np.minimum(evidence.odometry_ratio / FACTORS[:, None] ** 2 - LEAST, 0.0)
+    sums = np.nansum(odds + excluded, axis=1) - (np.log(FACTORS) / NOISIER) ** 2 / 2
+    return float(expit(-sums.max()))
 
 
 def sequence_evidence(state: MapState, sequences: np.ndarray, after: int) -> SequenceEvidence:

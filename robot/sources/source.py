@@ -80,6 +80,8 @@ class SourceInfo(Settings):
     """Whether views are signed departures from rest, in any unit, instead of values in 0..1."""
     pokes: PokeConfig | None = None
     """Pokes of an arm without a whisker head."""
+    drives: bool = False
+    """Whether it is a robot on wheels that touches; one with `planar_whiskers` is one too."""
     cell_size: PositiveFloat | None = None
     """Pose-cell side length that suits the data, m."""
     head: HeadConfig | None = None

@@ -60,9 +60,11 @@ def _choose_presets(config: RunConfig, source: Source, other_touch: bool) -> tup
         return ("arm",) if source.info.planar_whiskers is None else ("create",)
     if other_touch:
         return ("touch",)
-    recall = config.recall
+    recall, drives = config.recall, source.info.drives or source.info.planar_whiskers is not None
     fov = recall.sector_fov if "sector_fov" in recall.model_fields_set else "whiskers"
-    return ("touch",) if source.whiskers and fov == "whiskers" else ()
+    if not source.whiskers or fov != "whiskers":
+        return ()
+    return ("create", "touch") if drives else ("touch",)
 
 
 def _fill(settings: Any, values: dict[str, Any]) -> Any:

@@ -103,7 +103,10 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
         "templates": {"patch": 2},
         "keyframes": {"noise": {"per_cell": 0.15, "heading_per_cell": 0.03, "heading_per_radian": 0.1}},
     },
-    # Fox et al. 2012, II and III: the defaults of `grid` are those of their Create.
-    "create": {},
+    # Fox et al. 2012, II and III: the defaults of `grid` are those of their Create. Before `touch`: wheels
+    # keep the heading on a straight (0.027 rad after a metre; that arm 0.28), and turn by some per cent too
+    # far or too little (`robot/simulation/create/wheel_odometry.py`). With the arm's noise, rooms that are
+    # alike after half a turn are closed by half a turn.
+    "create": {"keyframes": {"noise": {"heading_per_cell": 0.006}, "turn_error_sd": 0.05}},
 }
 """Values of settings that a configuration leaves open, nested as in a configuration."""

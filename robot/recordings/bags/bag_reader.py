@@ -185,7 +185,7 @@ def read_bag(settings: RecordingConfig, judge: InputJudge, pokes: PokeConfig) ->
     found = [*odometry.errors, *(views.errors if views else []), *(truth.errors if truth else [])]
     raise_errors(list(dict.fromkeys(found)))
     raise_errors(_judge(odometry, judge))
-    rings, info = list[Observation](), SourceInfo()
+    rings, info = list[Observation](), SourceInfo(drives=config.touch is not None)
     if views is not None and config.wrench is not None:
         views, rings = read_rings(bag, odometry, views, config.wrench, pokes)
         info = SourceInfo(pokes=pokes)

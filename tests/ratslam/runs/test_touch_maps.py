@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 
+from evaluation.metrics.trajectory import ate, interpolate, read_tum
 from ratslam.core.session import CHUNK, Session, Step
 from ratslam.mapping import keyframe_merger
 from ratslam.mapping.loop_closures import Verdict
@@ -19,11 +20,16 @@ from ratslam.mapping.pose_graph import read_json
 from ratslam.methods.localise import LocaliseBackend
 from ratslam.places.localiser import Localisation, Localiser
 from ratslam.recall.memory import MapFeedback, MergedRows
+from ratslam.runs.run import run
 from ratslam.runs.settings.packaged import PRESETS
+from ratslam.runs.settings.run_config import RunConfig
+from robot.simulation.create.wheel_odometry import WheelsConfig, simulate_wheel_odometry
 from tactile.base.se2 import between, wrap
 from tactile.base.types import Observation
 from tests.golden import touch
 from tests.helpers.g2o import read_g2o
+from tests.helpers.ros_bags import write_bag
+from tests.helpers.rounds import path_of_rounds, rounds, touched
 from tests.ratslam.runs import touch_walks as walks
 
 
@@ -429,3 +435,55 @@ def test_a_piece_that_stays_untied_continues_from_a_checkpoint(stop: int) -> Non
     expected, path = whole.arrays(), whole.map.trajectory()
     assert len(expected["map/tie_odds/ground"]) == 1
     assert np.array_equal(check_continued(readings, stop, expected).map.trajectory(), path)
+
+
+def drawn_room(random: np.random.Generator) -> tuple[float, tuple[float, float], np.ndarray]:
+    """Rounds and their sides, m, in a room with walls [W, 4]: half of the rooms are alike after half a turn
+    but for up to five short walls."""
+    right, ahead = sides = float(random.uniform(2.5, 6.0)), float(random.uniform(2.0, 5.0))
+    left, below, more, above = random.uniform(0.8, 1.6, 4)
+    if random.random() < 0.5:
+        more, above = left, below
+    x, y = (-left, right + more), (-below, ahead + above)
+    walls = [(x[0], y[0], x[1], y[0]), (x[1], y[0], x[1], y[1])]
+    walls += [(x[1], y[1], x[0], y[1]), (x[0], y[1], x[0], y[0])]
+    for _ in range(random.integers(0, 6)):
+        at, half = random.uniform((x[0], y[0]), (x[1], y[1])), random.normal(0, 0.25, 2)
+        inside = 0.35 < at[0] < right - 0.35 and 0.35 < at[1] < ahead - 0.35
+        if inside or not (-0.35 < at[0] < right + 0.35 and -0.35 < at[1] < ahead + 0.35):
+            walls.append((*(at - half), *(at + half)))
+    return float(random.choice([1.3, 1.6, 2.2, 3.2])), sides, np.array(walls)
+
+
+ROOMS = 12
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("wheels", ["move", "measured"])
+def test_rooms_that_look_alike_after_half_a_turn_make_no_map_worse_than_odometry(wheels, tmp_path):
+    """Five proximity sensors of a Create 3, by wheels with a new error in each move, or as measured."""
+    found = []
+    for number in range(ROOMS):
+        random = np.random.default_rng(number)
+        count, sides, walls = drawn_room(random)
+
+        def measure(moves: np.ndarray, random: np.random.Generator = random) -> np.ndarray:
+            kind = np.cumsum(np.any(np.diff(moves, axis=0, prepend=moves[:1]) != 0, axis=1))
+            return simulate_wheel_odometry(WheelsConfig(noise=wheels), moves, kind, random)
+
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        bag = write_bag(folder, "mcap", touched(rounds(count, measure, sides, walls, every=10), "/ir"))
+        touch = {"topic": "/ir", "low": 0.0, "high": 1100.0, "rows": 1, "columns": 5, "tolerance": 0.02}
+        topics = {"odometry": "/odom", "touch": touch, "samples": "views"}
+        config = RunConfig.model_validate({"recording": {"file": str(bag), "topics": topics}})
+        run(config, folder / "run")
+        mapped, odometry = (read_tum(folder / "run" / f"{name}.tum") for name in ("trajectory", "odometry"))
+        truth = interpolate(*path_of_rounds(count, sides), mapped[0])
+        found.append((ate(mapped[1], truth), ate(odometry[1], truth)))
+        print(f"{wheels}, room {number}: {found[-1][0]:.3f} m, odometry {found[-1][1]:.3f}", flush=True)
+    of_map, of_odometry = np.array(found).T
+    print(f"{wheels}: {np.median(of_map):.3f} m, odometry {np.median(of_odometry):.3f}", flush=True)
+    assert np.all(of_map <= 1.05 * of_odometry)
+    assert np.median(of_map / of_odometry) < 0.5
