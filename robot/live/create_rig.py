@@ -58,8 +58,7 @@ MAX_READ_TIME = 1.0
 
 
 class CreateRig(PolledRig):
-    """A Create 2 that feels walls by its bumper and its light bumpers; a context manager that leaves it at
-    rest.
+    """A Create without its touch; a context manager that leaves it at rest.
 
     Attributes:
         create: settings of the robot. robot: the device. monitor: of its touch. alive: [W] bool, sensors with
@@ -67,13 +66,13 @@ class CreateRig(PolledRig):
     """
 
     monitor: LightMonitor | StrainMonitor
+    alive: np.ndarray
 
     def __init__(self, config: LiveConfig, stopped: Callable[[], bool]) -> None:
         assert config.create is not None
         PolledRig.__init__(self, config, stopped)
         self.create = config.create
         self.robot = CreateDriver(self.create)
-        self.monitor, self.alive = LightMonitor(self.create.plan.behaviour), np.ones(len(LIGHTS), bool)
         self._free = self.epoch  # newest time at which the bumper was not pressed
         self.doubt: Event | None = None  # what speaks against the odometry
 
@@ -113,8 +112,6 @@ class CreateRig(PolledRig):
         self.robot.odometry()
         self.robot.gap()
         self.epoch = self._free = time.monotonic()
-        if isinstance(self.monitor, LightMonitor):
-            self.record_event("light", str(self.monitor))
 
     @property
     def bumped(self) -> bool:
@@ -156,16 +153,8 @@ class CreateRig(PolledRig):
         return self.robot.counts.good > good and not any(motion[:3])
 
     def reading(self, report: Report) -> Report | Observation:
-        """What is passed on of a motion: here the image of the light bumpers at its end and, of a pressed
-        bumper, a contact towards the strongest of them, if any is above free air."""
-        reply = self.robot.last_reply
-        assert reply is not None
-        assert isinstance(self.monitor, LightMonitor)
-        image, motion = self.monitor.image(np.array(reply.light)), MotionKind(report.motion)
-        bumped = report.moment == StepEnd.ABORT
-        contact = (np.arange(len(image)) == image.argmax()) & (image > 0) & bumped
-        plain = observation(report.odometry, image[None, :, None], motion=motion, whiskers=len(image))
-        return plain._replace(contact=contact, point=self.monitor.edge * contact[:, None])
+        """What is passed on of a motion."""
+        return report
 
     def strain_series(self, state: CreateState, rows: int) -> np.ndarray:
         """The samples [T, W, 2] of the first rows of a slow drive; T is 0 for other motions, without
@@ -175,6 +164,31 @@ class CreateRig(PolledRig):
 
     def __exit__(self, *_: object) -> None:
         self.robot.close()
+
+
+class LightRig(CreateRig):
+    """A Create 2 that feels walls by its bumper and its light bumpers."""
+
+    monitor: LightMonitor
+
+    def __init__(self, config: LiveConfig, stopped: Callable[[], bool]) -> None:
+        super().__init__(config, stopped)
+        self.monitor, self.alive = LightMonitor(self.create.plan.behaviour), np.ones(len(LIGHTS), bool)
+
+    def begin(self) -> None:
+        super().begin()
+        self.record_event("light", str(self.monitor))
+
+    def reading(self, report: Report) -> Observation:
+        """The image of the light bumpers at the end of a motion and, of a pressed bumper, a contact towards
+        the strongest of them, if any is above free air."""
+        reply = self.robot.last_reply
+        assert reply is not None
+        image, motion = self.monitor.image(np.array(reply.light)), MotionKind(report.motion)
+        bumped = report.moment == StepEnd.ABORT
+        contact = (np.arange(len(image)) == image.argmax()) & (image > 0) & bumped
+        plain = observation(report.odometry, image[None, :, None], motion=motion, whiskers=len(image))
+        return plain._replace(contact=contact, point=self.monitor.edge * contact[:, None])
 
 
 class WhiskeredRig(HeadRig, CreateRig):
@@ -212,9 +226,6 @@ class WhiskeredRig(HeadRig, CreateRig):
             self.monitor.add(frames)
         CreateRig.poll(self)
 
-    def reading(self, report: Report) -> Report:
-        return report
-
     def strain_series(self, state: CreateState, rows: int) -> np.ndarray:
         nothing = super().strain_series(state, rows)
         if state is not CreateState.FWD2:
@@ -234,7 +245,7 @@ class WhiskeredRig(HeadRig, CreateRig):
 def open_create(config: LiveConfig, stopped: Callable[[], bool]) -> CreateRig:
     """The rig of a session on a Create, by what it feels with."""
     assert config.create is not None
-    return (CreateRig if config.create.touch == "light" else WhiskeredRig)(config, stopped)
+    return (LightRig if config.create.touch == "light" else WhiskeredRig)(config, stopped)
 
 
 FREE_SDS = 8.0

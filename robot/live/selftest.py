@@ -19,7 +19,7 @@ from robot.drivers.create.serial_link import open_port
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.safety import check_controller
 from robot.live.arm_route import check_targets, plan_path
-from robot.live.create_rig import CreateRig, LightMonitor, WhiskeredRig, open_create
+from robot.live.create_rig import CreateRig, LightRig, WhiskeredRig, open_create
 from robot.live.live_config import LiveConfig
 from robot.live.live_rig import ArmRig, Rig
 from robot.live.polling import HeadRig
@@ -147,8 +147,8 @@ def start_and_check(rig: ArmRig | CreateRig) -> Iterator[str]:
             raise InputError("live.create", found, "a free bumper", cure)
         yield f"Create: {rig.create.port}, safe mode, at rest, guarded by a watchdog process"
         rig.monitor.begin()
-        if isinstance(rig.monitor, LightMonitor):
-            yield _learn_light(rig, rig.monitor)
+        if isinstance(rig, LightRig):
+            yield _learn_light(rig)
     else:
         rig.arm.start()
         yield f"arm: {rig.config.arm.host}, admitted, states at {rig.config.arm.hz} Hz"
@@ -187,19 +187,19 @@ def _check_stream(rig: HeadRig) -> str:
     return f"clocks: head {measured * 1e3:.1f} ms"
 
 
-def _learn_light(rig: CreateRig, monitor: LightMonitor) -> str:
+def _learn_light(rig: LightRig) -> str:
     """Learns the signals of the light bumpers in free air, in which the robot must stand."""
     signals = list[tuple[int, ...]]()
     for _ in range(round(LISTEN_TIME * rig.create.rate)):
         rig.robot.refresh()
         rig.poll()
         signals += [reply.light for reply in [rig.robot.last_reply] if reply is not None]
-    monitor.learn(np.array(signals, float))
-    if (monitor.free**2 > MOST_LIGHT).any():  # half of the span of its image, a logarithm
-        found = f"something near, or dirt: {monitor}"
+    rig.monitor.learn(np.array(signals, float))
+    if (rig.monitor.free**2 > MOST_LIGHT).any():  # half of the span of its image, a logarithm
+        found = f"something near, or dirt: {rig.monitor}"
         cure = "turn the robot to where nothing is near its front and sides; clean the windows"
         raise InputError("live.create.touch", found, "free light bumpers", cure)
-    return f"light bumpers: {monitor}"
+    return f"light bumpers: {rig.monitor}"
 
 
 def _check_whiskers(rig: WhiskeredRig) -> str:

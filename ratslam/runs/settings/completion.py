@@ -56,13 +56,12 @@ def complete(config: RunConfig, source: Source, extent_m: float | None = None) -
 
 def _choose_presets(config: RunConfig, source: Source, other_touch: bool) -> tuple[PresetName, ...]:
     """The presets of a configuration that names none."""
+    info, recall = source.info, config.recall
+    drives = info.drives or info.planar_whiskers is not None
     if config.backend == "grid":
-        return ("arm",) if source.info.planar_whiskers is None else ("create",)
-    if other_touch:
-        return ("touch",)
-    recall, drives = config.recall, source.info.drives or source.info.planar_whiskers is not None
+        return ("create",) if drives else ("arm",)
     fov = recall.sector_fov if "sector_fov" in recall.model_fields_set else "whiskers"
-    if not source.whiskers or fov != "whiskers":
+    if not other_touch and (not source.whiskers or fov != "whiskers"):
         return ()
     return ("create", "touch") if drives else ("touch",)
 

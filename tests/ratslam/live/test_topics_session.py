@@ -109,7 +109,8 @@ def session(
         process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=PATIENCE)
     finally:
-        process.kill()
+        with process:  # closes its pipes
+            process.kill()
     assert process.returncode == 130, told
     assert "Traceback" not in told
     return json.loads((folder / "live.json").read_text())
@@ -378,8 +379,9 @@ def test_ten_minutes_lose_no_message_and_wait_for_none(loopback, tmp_path):
         sent = [int(word) for word in robot.stdout.readline().split()]
         time.sleep(1.0)
         process.send_signal(signal.SIGINT)
-        process.wait(timeout=PATIENCE)
-        reader.join()
+        with process:  # closes its pipes
+            process.wait(timeout=PATIENCE)
+            reader.join()
         robot.stdin.write("\n")
         robot.stdin.flush()
     assert process.returncode == 130, told
