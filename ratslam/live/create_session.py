@@ -14,7 +14,7 @@ from ratslam.live.live_robot import LiveRobot, mapped_config, mapper_status
 from ratslam.live.mapper_process import Mapper, MappingJob
 from ratslam.runs.settings.run_config import RunConfig
 from robot.drivers.create.protocol import LIGHTS
-from robot.live.create_rig import CreateRig, open_create, run_create_loop
+from robot.live.create_rig import RIGS, CreateRig, run_create_loop
 from robot.live.polling import HeadRig
 from robot.recordings.cdr import doubts_of
 from robot.simulation.create.simulated_session import describe_create
@@ -53,7 +53,7 @@ class CreateSession(LiveRobot):
     def __init__(self, config: RunConfig, directory: Path, stopped: Callable[[], bool]) -> None:
         assert config.live is not None
         assert config.live.create is not None
-        self.rig = open_create(config.live, stopped)
+        self.rig = RIGS[config.live.create.touch](config.live, stopped)
         plan = config.live.create.plan
         arena = make_arena(plan.arena, plan.seed)
         info = describe_create(plan, arena)

@@ -95,8 +95,8 @@ def run_live_session(
                         raise
                 standing = rig.rest()
             if robot.count:
-                if waiting := mapper.waiting():
-                    log(f"mapper: {waiting} {robot.unit}s are still to be mapped")
+                if behind := mapper.behind():
+                    log(f"mapper: {behind:.1f} s behind, and is waited for")
                 card = mapper.finish(not fault.outcome.planned)
         finally:
             if fault is not None:

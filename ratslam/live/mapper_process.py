@@ -144,15 +144,11 @@ class Mapper(AbstractContextManager["Mapper"]):
         """Passes warnings about the input to the run."""
         self._outbox.put(sentences)
 
-    def waiting(self) -> int:
-        """Number of samples that are not mapped yet."""
-        self.receive()
-        return len(self._offered) - (self.mapped[-1].number + 1 if self.mapped else 0)
-
     def behind(self) -> float:
         """Waiting time of the oldest sample that is not mapped yet, s."""
-        waiting = self.waiting()
-        return time.monotonic() - self._offered[-waiting] if waiting else 0.0
+        self.receive()
+        done = self.mapped[-1].number + 1 if self.mapped else 0
+        return time.monotonic() - self._offered[done] if done < len(self._offered) else 0.0
 
     def receive(self) -> None:
         """Reads the messages of the process."""
@@ -190,11 +186,12 @@ class Mapper(AbstractContextManager["Mapper"]):
             interrupted: whether the session ended early.
         """
         self._outbox.put(interrupted)
-        waiting, due = self.waiting(), time.monotonic() + FINISH_TIMEOUT
+        known, due = len(self.mapped), time.monotonic() + FINISH_TIMEOUT
         while self._card is None and self.alive and time.monotonic() < due:
             self._line.poll(0.05)
-            if self.waiting() < waiting:
-                waiting, due = self.waiting(), time.monotonic() + FINISH_TIMEOUT
+            self.receive()
+            if len(self.mapped) > known:
+                known, due = len(self.mapped), time.monotonic() + FINISH_TIMEOUT
         return self._card
 
     def _send(self) -> None:

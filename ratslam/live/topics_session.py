@@ -66,13 +66,8 @@ class TopicsSession(LiveRobot):
         origin = {"live": self._config.live.model_dump(mode="json", include={"topics"})}
         origin |= {} if self.rig.steps.whiskers else {"views": views_of(self._config)[1]}
         pokes = self.rig.steps.pokes
-        assert self._config.recording is not None
-        topics = self._config.recording.topics
-        info = SourceInfo(
-            provenance=origin,
-            drives=topics is not None and topics.touch is not None,
-            pokes=None if pokes is None else pokes.config,
-        )
+        drives = pokes is None and self.rig.steps.whiskers > 0
+        info = SourceInfo(provenance=origin, drives=drives, pokes=None if pokes is None else pokes.config)
         source = SourceDescription(shape, self.rig.steps.whiskers, 0.0, info)
         extent = 10.0 if self._config.grid.side is None else self._config.grid.side / 2
         mapped = mapped_config(self._config, self._directory, RESERVED)

@@ -50,10 +50,8 @@ EXTENT = 50
 """Keyframes of the older pass before and after it, beyond those, that may be compared."""
 LEAST, MOST = -6.0, 8.0
 """Limits of R in L; odometry has outliers."""
-FACTORS = np.exp(np.linspace(0.0, 3.0, 31))
-"""Factors by which the odometry may be noisier than set."""
 NOISIER = 0.35
-"""Standard deviation of their logarithm: half as noisy again is usual, twice as noisy happens."""
+"""Standard deviation of the log of the factor by which the odometry is noisier than set."""
 EDGES = np.array([-1.5, 0.0, 1.5])
 """Gains, nat, between views that contradict, disagree, agree and fit."""
 KINDS = len(EDGES) + 3
@@ -115,12 +113,9 @@ def judge_anew(state: MapState, sequences: np.ndarray) -> None:
 
 def doubt_of_closures(state: MapState) -> float:
     """Probability that the accepted sequences of a map are false if they are so together,
-    1 / (1 + exp(S)), with the sum S of their log-odds, in which R below `LEAST` counts in full; NaN if
-    nothing is said of any.
-
-    Where a room looks alike after half a turn, every view on the way agrees with a false sequence, and only
-    odometry speaks against it. The odometry may be noisier than set, by a factor f with a prior of its own
-    (`NOISIER`): R is then about R / f^2, and S the sum with the likeliest factor.
+    1 / (1 + exp(S)), with the sum S of their log-odds, R below `LEAST` counted in full; NaN if nothing is
+    said of any. Where a room looks alike after half a turn, only odometry speaks against a false sequence. It
+    may be noisier than set, by the likeliest factor f of those with a prior (`NOISIER`): R / f^2 counts.
     """
     if not state.appearance.JUDGED or state.config.may_be_carried:
         return np.nan
@@ -129,8 +124,9 @@ def doubt_of_closures(state: MapState) -> float:
     odds = evidence.log_odds(shipped_weights())
     if not np.isfinite(odds).any():
         return np.nan
-    excluded = np.minimum(evidence.odometry_ratio / FACTORS[:, None] ** 2 - LEAST, 0.0)
-    sums = np.nansum(odds + excluded, axis=1) - (np.log(FACTORS) / NOISIER) ** 2 / 2
+    log = np.linspace(0.0, 3.0, 31)  # of the factors
+    excluded = np.minimum(evidence.odometry_ratio / np.exp(2 * log[:, None]) - LEAST, 0.0)
+    sums = np.nansum(odds + excluded, axis=1) - (log / NOISIER) ** 2 / 2
     return float(expit(-sums.max()))
 
 

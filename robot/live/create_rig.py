@@ -242,10 +242,8 @@ class WhiskeredRig(HeadRig, CreateRig):
         self.head.close()
 
 
-def open_create(config: LiveConfig, stopped: Callable[[], bool]) -> CreateRig:
-    """The rig of a session on a Create, by what it feels with."""
-    assert config.create is not None
-    return (LightRig if config.create.touch == "light" else WhiskeredRig)(config, stopped)
+RIGS = {"light": LightRig, "whiskers": WhiskeredRig}
+"""The rig of a session on a Create, by `live.create.touch`."""
 
 
 FREE_SDS = 8.0

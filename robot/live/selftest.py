@@ -19,7 +19,7 @@ from robot.drivers.create.serial_link import open_port
 from robot.drivers.outcome import SessionOutcome
 from robot.drivers.ur10.safety import check_controller
 from robot.live.arm_route import check_targets, plan_path
-from robot.live.create_rig import CreateRig, LightRig, WhiskeredRig, open_create
+from robot.live.create_rig import RIGS, CreateRig, LightRig, WhiskeredRig
 from robot.live.live_config import LiveConfig
 from robot.live.live_rig import ArmRig, Rig
 from robot.live.polling import HeadRig
@@ -59,7 +59,7 @@ def check_session(
         yield from told
         return
     if config.create is not None:
-        with open_create(config, lambda: False) as robot:
+        with RIGS[config.create.touch](config, lambda: False) as robot:
             yield from find_devices(robot)
             yield from start_and_check(robot)
         return

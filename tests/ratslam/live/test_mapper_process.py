@@ -34,7 +34,7 @@ def test_a_late_mapper_is_waited_for_and_a_stuck_one_is_given_up(process, mapped
         until(mapper.prepare(None))
         for number in range(COUNT):
             mapper.offer(Sample(float(number), None, None))
-        assert mapper.waiting() > COUNT / 2
+        assert mapper.behind() > 0
         monkeypatch.setattr(mapper_process, "FINISH_TIMEOUT", COUNT * EACH * 0.75)
         began = time.monotonic()
         assert mapper.finish(False) is None  # neither sends a score
