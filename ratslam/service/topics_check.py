@@ -123,6 +123,11 @@ def _of_robot(
         return Diagnosis(what, tuple(rows), notes, ("no topic of views, touch or a wrench",))
     if sees != "wrench":
         topics[sees] = _with_values(_part(topics[sees]), described, wheels["topic"])
+    if "low" in topics[sees]:
+        said = (
+            f"{topics[sees]['topic']}: the lowest and highest values of these {seconds:g} s count as 0 and 1"
+        )
+        notes = (*notes, f"{said}: let it feel all that it can meanwhile, or set touch.low and high")
     recording["topics"] = topics
     sections = {"live": {"topics": {"source": address}}, "recording": recording, **config}
     return Diagnosis(what, tuple(rows), notes, faults, heard.advice, sections)

@@ -272,6 +272,7 @@ class TopicSteps:
         self._views = deque[_View](maxlen=WAITING)
         self._reader: Any = None
         self._image: tuple[int, ...] | None = None
+        self._outside = list[float]()  # shares of touch values outside of their span
         self._last = dict[str, int]()  # newest stamp by topic, ns
         self._back = dict[str, int]()  # arrival of the first message since then with an earlier stamp
         self._outage = False
@@ -480,7 +481,14 @@ class TopicSteps:
                 return None
             rows, columns = self._reader.shape
             self.shape, self.whiskers = (rows, columns, 1), rows * columns
-            return np.clip(self._reader.scaled(values), 0.0, 1.0).reshape(self.shape)
+            scaled, touch = self._reader.scaled(values), self._topics.touch
+            self._outside.append(float(np.mean(np.abs(scaled - 0.5) > 0.5)))
+            if len(self._outside) == JUDGED:
+                if sum(self._outside) > JUDGED / 2:  # in a bag it is an error, by all values
+                    found = f"most values of {touch.topic} are not within {touch.low:g} to {touch.high:g}"
+                    self._say("outside", f"{found}; set recording.topics.touch.low and high")
+                self._outside.clear()
+            return np.clip(scaled, 0.0, 1.0).reshape(self.shape)
         kind, views = self._chosen["views"].kind, self._topics.views
         assert views is not None
         if kind in IMAGES:

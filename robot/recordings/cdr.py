@@ -148,6 +148,7 @@ DOUBTFUL = {
     "gap": "odometry was missing, and a pose bridges it",
     PIECE: "the odometry did not go on, and a piece of the map begins",
     "unusable": "messages could not be used",
+    "outside": "values of touch are outside of their span and count as 0 or 1",
     "garbage": "what came is no message",
     "remainders": "the robot may lose parts of its motion",
     "fault": "a fault ended it",

@@ -75,11 +75,13 @@ def drive(seconds: float, seed: int = 0, period: int = 20_000_000, every: int = 
     return sorted(found, key=lambda entry: entry.time)
 
 
-def samples_of(config: RecordingConfig, entries: list[Entry], *pokes: PokeConfig) -> list:
+def samples_of(
+    config: RecordingConfig, entries: list[Entry], *pokes: PokeConfig, say=lambda name, text: None
+) -> list:
     """The samples that come out of messages, each added as it arrives."""
     messages = LiveMessages("ws://nowhere", config.topics, lambda sentence: None)
     messages.topics = {entry.topic: Topic(entry.topic, entry.kind, 1) for entry in entries}
-    steps, found = TopicSteps(config, messages, 1e6, lambda name, text: None, *pokes), []
+    steps, found = TopicSteps(config, messages, 1e6, say, *pokes), []
     for entry in entries:
         content = built(ROS2, entry.kind, entry.fields)
         if entry.topic.startswith("/tf"):
@@ -174,6 +176,25 @@ def test_images_and_touch_become_views_as_in_a_bag(tmp_path):
         found = bits(samples_of(config, entries))
         assert found == bits(open_recording(config.model_copy(update={"file": path})))[: len(found)]
         assert len(found) > 15
+
+
+def test_touch_whose_values_mostly_lie_outside_of_their_span_is_said():
+    """As often as 512 messages say so. In a bag it is an error."""
+    wheels = [entry for entry in drive(22.0) if entry.topic == "/odom"]
+    kind, told = "sensor_msgs/msg/JointState", list[str]()
+    joints = [
+        Entry("/joints", kind, at, {"header": header(at), "name": ["a", "b"], "position": [7.0, k % 4 / 4]})
+        for k, at in enumerate(range(START + 10**7, START + 22 * 10**9, 2 * 10**7))
+    ]
+    entries = sorted([*wheels, *joints], key=lambda entry: entry.time)
+    for high, times in ((0.4, 2), (6.9, 0)):
+        told.clear()
+        config = recording(touch={"topic": "/joints", "high": high})
+        samples_of(config, entries, say=lambda name, text: told.append(f"{name}: {text}"))
+        assert (
+            told
+            == ["outside: of /joints, most are: 0 to 0.4; set recording.topics.touch.low and high"] * times
+        )
 
 
 POKES = PokeConfig(directions=4, reach=0.12, speed=0.05)
