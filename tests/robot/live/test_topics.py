@@ -191,10 +191,10 @@ def test_touch_whose_values_mostly_lie_outside_of_their_span_is_said():
         told.clear()
         config = recording(touch={"topic": "/joints", "high": high})
         samples_of(config, entries, say=lambda name, text: told.append(f"{name}: {text}"))
-        assert (
-            told
-            == ["outside: of /joints, most are: 0 to 0.4; set recording.topics.touch.low and high"] * times
+        said = (
+            "outside: most values of /joints are not within 0 to 0.4; set recording.topics.touch.low and high"
         )
+        assert told == [said] * times
 
 
 POKES = PokeConfig(directions=4, reach=0.12, speed=0.05)
