@@ -16,7 +16,7 @@ ROOMS = [
     if len(list(path.parent.rglob("*.py"))) > 1
 ]
 MOST = {
-    "rooms": 30, "folders": 50, "files": 434, "product lines": 83_360, "code lines": 56_772,
+    "rooms": 30, "folders": 50, "files": 434, "product lines": 83_361, "code lines": 56_773,
     "test lines": 45_500, "largest file": 600, "longest function": 80, "public names": 1_997,
     "all names": 3_137, "records": 326, "short and called once": 62, "unused private names": 0,
     "twin names": 0, "module circles": 0, "room circles": 0,

@@ -26,7 +26,7 @@ from robot.recordings.bags.topics_config import TopicsConfig
 from robot.recordings.bags.transforms import POSES, TWISTS, frames_of, holds_velocities, value_of
 from robot.recordings.bags.views import CLOUD, COVERED, IMAGES, SCAN, RangeReader, grey_image
 from robot.recordings.bags.wrench_pokes import WRENCHES, PokeReader, force_of
-from robot.recordings.cdr import PIECE
+from robot.recordings.cdr import RESET
 from robot.recordings.input_judge import GAP, JUMP, LEAST_GAP, InputJudge, MotionTrack, UnitLimits
 from robot.recordings.recording_config import RecordingConfig
 from robot.recordings.video import image_view
@@ -105,7 +105,7 @@ class OdometryTrack:
         if last is not None:
             step = None if self.held else between(self._value, new)
             event = self._judge(time - last, step, new, outage)
-            if event[0] == PIECE:
+            if event[0] == RESET:
                 self.piece += 1
                 self._latest.clear()
             elif step is None:
@@ -171,7 +171,7 @@ class OdometryTrack:
         if step is None:
             if not gap:
                 return "", ""
-            return PIECE, f"no velocities for {dt:.3g} s: nobody knows how the robot moved meanwhile"
+            return RESET, f"no velocities for {dt:.3g} s: nobody knows how the robot moved meanwhile"
         began, first = self._latest[0]
         length, way = (float(np.hypot(*each[:2])) for each in (step, between(first, new)))
         pace = way / (dt + self._latest[-1][0] - began)
@@ -179,10 +179,10 @@ class OdometryTrack:
             said = f"no odometry for {dt:.3g} s; the pose after it is {length:.3g} m away"
             if self._goes_on(step, new, dt) and pace < max(JUMP * self._fastest, SLOWEST):
                 return "gap", f"{said} and bridges it"
-            return PIECE, f"{said}: the odometry began anew, or the robot was carried"
+            return RESET, f"{said}: the odometry began anew, or the robot was carried"
         wild = len(self._steps) > FEW and pace > JUMP * max(self._fastest, SLOWEST)
         if pace > self._limits.speed or (wild and not self._goes_on(step, new, dt)):
-            return PIECE, f"the odometry jumps by {length:.3g} m in {dt:.3g} s: it began anew"
+            return RESET, f"the odometry jumps by {length:.3g} m in {dt:.3g} s: it began anew"
         self._fastest = max(self._fastest, pace)
         return "", ""
 
@@ -426,8 +426,8 @@ class TopicSteps:
         if event:
             self._say(event, said)
         self._recent.append((stamp / 10**9, *value))
-        self._pieces.append(event == PIECE)
-        if event == PIECE and sum(self._pieces) > MOST_PIECES:
+        self._pieces.append(event == RESET)
+        if event == RESET and sum(self._pieces) > MOST_PIECES:
             self._judge(topic)
             found = f"the odometry began anew {sum(self._pieces)} times in {len(self._pieces)} messages"
             raise session_fault(SessionOutcome.TOPIC_UNUSABLE, f"{topic}: {found}")

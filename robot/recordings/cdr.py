@@ -129,8 +129,9 @@ class Malformed(ValueError):
     """A message that does not fit its schema."""
 
 
-PIECE = "piece"
-"""Name of the event before a sample that begins a piece of the map: no odometry leads to it."""
+PIECE, RESET = "piece", "reset"
+"""Names of the event before a sample that begins a piece of the map, as no odometry leads to it, and of the
+event that says why, which may come before the last samples of the piece before."""
 
 
 class Event(NamedTuple):
@@ -146,7 +147,7 @@ DOUBTFUL = {
     "lost": "the connection to the robot was lost",
     "vanished": "a topic was no longer advertised",
     "gap": "odometry was missing, and a pose bridges it",
-    PIECE: "the odometry did not go on, and a piece of the map begins",
+    RESET: "the odometry did not go on, and a piece of the map begins",
     "unusable": "messages could not be used",
     "outside": "values of touch are outside of their span and count as 0 or 1",
     "garbage": "what came is no message",

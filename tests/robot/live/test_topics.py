@@ -254,7 +254,7 @@ def test_a_pause_is_bridged_by_poses_and_begins_a_piece_with_velocities():
     assert told == ["gap"]
     assert not any(begins for _, begins, _ in found)
     told, found = events_of(cut, odometry={"topic": "/odom", "use": "twist"})
-    assert told == ["piece"]
+    assert told == ["reset"]
     assert sum(begins for _, begins, _ in found) == 1
     (first,) = [sample for sample, begins, _ in found if begins]
     assert tuple(first.reading.odometry[:3]) == (0.0, 0.0, 0.0)
@@ -264,7 +264,7 @@ def test_a_pause_is_bridged_by_poses_and_begins_a_piece_with_velocities():
 def test_an_odometry_that_begins_anew_is_a_piece_and_no_jump(pause):
     before = shifted(drive(15.0), 0.0, x=7.0)
     told, found = events_of([*before, *shifted(drive(5.0, 1), 15.0 + pause)])
-    assert told == ["piece"]
+    assert told == ["reset"]
     assert sum(begins for _, begins, _ in found) == 1
     moves = np.array([sample.reading.odometry[:2] for sample, *_ in found])
     assert np.hypot(*moves.T).max() < 0.2
@@ -289,7 +289,7 @@ def test_poses_sent_many_times_end_the_session_with_the_setting_that_takes_each_
     with pytest.raises(SessionFault, match=r"mostly 20 alike.* --set recording.topics.odometry.every=20"):
         events_of(messages)
     told, found = events_of(messages, odometry={"topic": "/odom", "every": 20})
-    assert not {"gap", "piece"} & set(told)
+    assert not {"gap", "reset"} & set(told)
     assert len(found) > 100
 
 
@@ -306,7 +306,7 @@ def test_a_clock_that_is_set_back_ends_the_session_and_one_set_ahead_does_not():
     told, found = events_of(told_of(3.0))
     assert len(found) > 60
     assert not any(begins for _, begins, _ in found)
-    assert set(told) <= {"gap", "dropped", "piece"}
+    assert set(told) <= {"gap", "dropped", "reset"}
 
 
 @pytest.mark.parametrize("stamp", [0.0, 5.0])
@@ -427,6 +427,20 @@ def test_a_session_records_every_message_and_the_samples_that_were_mapped(bridge
     again = open_recording(recording().model_copy(update={"file": tmp_path / "session.mcap"}))  # as any bag
     assert bits(again)[: len(mapped)] == bits(mapped)
     assert session.rig.messages.counts == {"/odom": 500, "/scan": sum(e.topic == "/scan" for e in entries)}
+
+
+def test_a_piece_begins_where_it_did_live_and_is_told_as_often(loopback, tmp_path):
+    """Also where the last views of the piece before come after the odometry that began anew."""
+    whole = [*shifted(drive(6.0), 0.0, x=7.0), *shifted(drive(4.0, 1), 7.5)]
+    late = sorted(whole, key=lambda entry: entry.time + 2_500_000_000 * (entry.topic == "/scan"))
+    robot = PlainBridge(loopback, KINDS)
+    with session_on(robot, tmp_path / "session.mcap", max_wait=30.0) as session:
+        session.run(paced(robot, late))
+    read = Recording(tmp_path / "session.mcap")
+    (begun,) = np.flatnonzero(session.mapper.begun)
+    assert len(session.mapper.begun) > begun + 20 > 40
+    assert read.begins == {begun}
+    assert doubts_of(read.events) == doubts_of(session.rig.events) != []
 
 
 def test_a_session_of_pokes_of_another_program_is_that_of_its_recording(loopback, tmp_path):
