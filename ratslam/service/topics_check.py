@@ -123,11 +123,10 @@ def _of_robot(
         return Diagnosis(what, tuple(rows), notes, ("no topic of views, touch or a wrench",))
     if sees != "wrench":
         topics[sees] = _with_values(_part(topics[sees]), described, wheels["topic"])
-    if "low" in topics[sees]:
-        said = (
-            f"{topics[sees]['topic']}: the lowest and highest values of these {seconds:g} s count as 0 and 1"
-        )
-        notes = (*notes, f"{said}: let it feel all that it can meanwhile, or set touch.low and high")
+        if "low" in topics[sees]:
+            said = f"{seconds:g} s: its lowest and highest values count as 0 and 1"
+            cure = "let it feel all that it can meanwhile, or set touch.low and high"
+            notes = (*notes, f"{topics[sees]['topic']}, heard for {said}; {cure}")
     recording["topics"] = topics
     sections = {"live": {"topics": {"source": address}}, "recording": recording, **config}
     return Diagnosis(what, tuple(rows), notes, faults, heard.advice, sections)

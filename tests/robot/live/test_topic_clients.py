@@ -13,7 +13,8 @@ from robot.live.topics_rig import open_client
 from tactile.base.errors import InputError
 from tests.helpers.ros_bags import tf, transform
 from tests.helpers.stand_in_robot import PlainBridge, SdkBridge, ZenohRobot
-from tests.robot.live.test_topics import KINDS, PATIENCE, drive, wait
+from tests.robot.live.test_topics import KINDS, drive
+from tests.robot.live.test_topics_rig import PATIENCE, wait
 
 STATIC = {"/tf_static": "tf2_msgs/msg/TFMessage"}
 

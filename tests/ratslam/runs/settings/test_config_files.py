@@ -20,7 +20,7 @@ from ratslam.runs.settings.openratslam import convert_parameters
 from ratslam.runs.settings.packaged import PRESETS, find_config, packaged_configs, read_citation
 from ratslam.runs.settings.run_config import RunConfig, changed_settings, load_config
 from ratslam.runs.settings.strict_yaml import MOVED, dump, load, parse, validate
-from robot.sources.source import SOURCES
+from robot.sources.source import SOURCES, SourceDescription, SourceInfo
 from robot.touch_source import TOUCH
 from tactile.base.errors import InputError, InputErrors
 from tests.helpers import tactile_arrays
@@ -333,6 +333,18 @@ def test_the_source_fills_head_cell_size_whiskers_and_the_extent_of_a_grid():
     assert complete(config, source).grid.side > 2 * EXTENT_MARGIN
     assert complete(config, source, 2.0).grid.side == round(2 * (EXTENT_FACTOR * 2.0 + EXTENT_MARGIN), 2)
     assert complete(given, source).grid.side == 3.0
+
+
+@pytest.mark.parametrize(("drives", "used"), [(True, ("create", "touch")), (False, ("touch",))])
+def test_a_robot_that_drives_has_the_odometry_noise_of_wheels(drives, used) -> None:
+    source = SourceDescription((1, 5, 1), 5, 0.0, SourceInfo(drives=drives))
+    completed = complete(RunConfig.model_validate(SQUARE), source)
+    assert completed.presets == used
+    assert (
+        completed.keyframes.noise.heading_per_cell
+        == PRESETS[used[0]]["keyframes"]["noise"]["heading_per_cell"]
+    )
+    assert completed.keyframes.noise.per_cell == PRESETS["touch"]["keyframes"]["noise"]["per_cell"]
 
 
 WRENCH = {"plugin": "wrench", "settings": {"simulation": {"path": {"circuits": "C"}}}}
